@@ -1,0 +1,1 @@
+"""A body is described once, for every backend: surface, tissue, supports, actuators, colliders."""

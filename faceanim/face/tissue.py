@@ -1,0 +1,87 @@
+"""The constants of a head's soft tissue, read from `assets/tissue.toml`, where each has its unit and source."""
+
+from __future__ import annotations
+
+import msgspec
+
+from faceanim.ground.errors import AssetError
+from faceanim.tissue.spring_law import SpringLaw
+
+
+class Membrane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Skin as a sheet: young_modulus [kPa], thickness [mm], factors [-] on the modulus of lips, lids and mucosa."""
+
+    young_modulus: float
+    thickness: float
+    lip: float
+    lid: float
+    mucosa: float
+
+
+class Springs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The spring law: see `SpringLaw`."""
+
+    alpha: float
+    s0: float
+    beta: float
+    zeta: float
+    height_ratio: float
+
+
+class Hypodermis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The tie from skin to bone.
+
+    modulus [kPa], smallest_thickness [mm], alpha [-], s0 [mm] of its growth; factors lip, lid, mucosa [-];
+    fade_length [mm] from the openings; clear_choice, blend_length [mm] of the share between cranium and jaw
+    """
+
+    modulus: float
+    smallest_thickness: float
+    alpha: float
+    s0: float
+    lip: float
+    lid: float
+    mucosa: float
+    fade_length: float
+    clear_choice: float
+    blend_length: float
+
+
+class Inertia(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """density [kg/mm^3], thickness [mm] of the tissue that moves with the skin, damping [1/s]."""
+
+    density: float
+    thickness: float
+    damping: float
+
+
+class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """stiffness [mN/mm per mm^2]; clearances [mm] to bone and eyeball; gap [mm] between lips and lids."""
+
+    stiffness: float
+    bone_clearance: float
+    eye_clearance: float
+    gap: float
+
+
+class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All soft-tissue constants of a head."""
+
+    membrane: Membrane
+    springs: Springs
+    hypodermis: Hypodermis
+    inertia: Inertia
+    contact: Contact
+
+    def law(self) -> SpringLaw:
+        """Return the spring law of the skin."""
+        s = self.springs
+        return SpringLaw(alpha=s.alpha, s0=s.s0, beta=s.beta, zeta=s.zeta, height_ratio=s.height_ratio)
+
+
+def parse_tissue(text: str, source: str) -> Tissue:
+    """Return the constants of a TOML text; raise `AssetError` naming what does not fit."""
+    try:
+        return msgspec.toml.decode(text, type=Tissue)
+    except msgspec.DecodeError as error:
+        raise AssetError(f"{source}: {error}") from error

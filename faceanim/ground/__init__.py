@@ -1,0 +1,1 @@
+"""Ground floor: compilation, arrays, errors and units, used by every other room."""

@@ -1,0 +1,97 @@
+"""The one place that talks to Numba's decorator: compile lazily, cache on disk, use the NumPy error model.
+
+Numba does not notice edits in a kernel that another kernel imports, so the cache folder is keyed by a hash of all
+kernel sources and of the versions that shape the machine code. Where that folder cannot be written, a temporary one
+is used and `cache_notice()` says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+_NOTICE: list[str] = []
+
+
+def user_cache() -> Path:
+    """Return the folder for cached files: FACEANIM_CACHE, else XDG_CACHE_HOME/faceanim, else ~/.cache/faceanim."""
+    override = os.environ.get("FACEANIM_CACHE")
+    if override:
+        return Path(override)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "faceanim"
+
+
+def _source_key() -> str:
+    import llvmlite
+    import numba
+    import numpy
+
+    digest = hashlib.sha256()
+    for version in (numba.__version__, llvmlite.__version__, numpy.__version__):
+        digest.update(version.encode())
+    for folder in (_PACKAGE / "kernels", _PACKAGE / "backends", _PACKAGE / "ground"):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def writable_folder(wanted: Path, purpose: str) -> Path:
+    """Return `wanted` if it can be made and written, else a temporary folder, and remember a notice about it."""
+    try:
+        wanted.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=wanted):
+            return wanted
+    except OSError as error:
+        fallback = Path(tempfile.gettempdir()) / f"faceanim-{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+        fallback = fallback / wanted.name
+        fallback.mkdir(parents=True, exist_ok=True)
+        _NOTICE.append(f"{purpose} folder {wanted} cannot be written ({error.strerror}); using {fallback}")
+        return fallback
+
+
+def cache_notice() -> list[str]:
+    """Return what is worth telling the user about cache folders that could not be used."""
+    return list(_NOTICE)
+
+
+def _prepare() -> Any:
+    # A busy second core must not stall the first one; read when the threading layer starts.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    import numba
+
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        numba.config.CACHE_DIR = str(writable_folder(user_cache() / "kernels" / _source_key(), "kernel cache"))
+    return numba
+
+
+_numba = _prepare()
+prange = _numba.prange
+
+
+def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False, inline: bool = False) -> Any:
+    """Compile a kernel on first use: no bounds checks, no division checks, contraction and reassociation allowed.
+
+    `fastmath` leaves out nnan and ninf, so that a kernel can still test for numbers that are not finite.
+    """
+
+    def wrap(f: Callable[..., Any]) -> Any:
+        options: dict[str, Any] = {
+            "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
+            "error_model": "numpy",
+            "cache": True,
+        }
+        if parallel:
+            options["parallel"] = True
+        else:
+            options["nogil"] = True
+        if inline:
+            options["inline"] = "always"
+        return _numba.njit(**options)(f)
+
+    return wrap if function is None else wrap(function)

@@ -1,0 +1,1 @@
+"""Compiled loops over bare arrays: no class, file, print or raise; the caller allocates and checks."""

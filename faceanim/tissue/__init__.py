@@ -1,0 +1,1 @@
+"""What flesh is made of: material parameters with units and sources."""
