@@ -28,14 +28,19 @@ class Attachment:
     The anchor of vertex i is sum_b bone_weight[i, b] * (pose_b applied to x_rest[i]); hence no force at rest.
     Force on i: -k (1 + (s/s0)^2)^alpha (x_i - a_i), s = |x_i - a_i|.
 
+    Beyond its springs the hypodermis is a layer that resists shear (a Pasternak foundation): with u = x - a, it stores
+    shear / 2 * |grad u|^2 per area, which keeps a compressed skin from crumpling.
+
     bone_weight : (n, n_bone) [-], rows sum to 1
     stiffness : (n,) [mN/mm], zero where nothing lies beneath
+    shear : (t,) [mN/mm], shear modulus times effective depth of the layer under each triangle; None = no such layer
     """
 
     bone_weight: Floats
     stiffness: Floats
     alpha: float = 1.0
     s0: float = 5.0
+    shear: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +142,10 @@ class Body:
             ("pinned", self.pinned, (n,)),
             ("attachment.bone_weight", self.attachment.bone_weight, (n, b)),
             ("attachment.stiffness", self.attachment.stiffness, (n,)),
+            ("attachment.shear", self.attachment.shear, (t,)),
         ):
+            if array is None:
+                continue
             if array.shape != shape:
                 raise UserError(f"body: {name} has shape {array.shape}; {shape} is needed")
         if not (np.isfinite(self.mass).all() and (self.mass > 0).all()):

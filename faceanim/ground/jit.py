@@ -65,9 +65,26 @@ def _prepare() -> Any:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     import numba
 
+    config: Any = numba.config
     if "NUMBA_CACHE_DIR" not in os.environ:
-        numba.config.CACHE_DIR = str(writable_folder(user_cache() / "kernels" / _source_key(), "kernel cache"))
+        config.CACHE_DIR = str(writable_folder(user_cache() / "kernels" / _source_key(), "kernel cache"))
+    if "NUMBA_CPU_FEATURES" not in os.environ:
+        config.CPU_FEATURES = _wide_features(config.ENABLE_AVX)
     return numba
+
+
+def _wide_features(wanted: bool) -> str | None:
+    """Return the machine's features with 512-bit vectors allowed where it has them, else None (Numba's own choice).
+
+    For some processors the compiler keeps to 256 bits although the force kernels gain from all 512. The features are
+    part of the key under which Numba caches machine code, so caches shared by several machines stay apart.
+    """
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features()
+    if not (wanted and features.get("avx512f")):
+        return None
+    return f"{features.flatten()},-prefer-256-bit"
 
 
 _numba = _prepare()
@@ -91,7 +108,7 @@ def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False
         else:
             options["nogil"] = True
         if inline:
-            options["inline"] = "always"
+            options["forceinline"] = True
         return _numba.njit(**options)(f)
 
     return wrap if function is None else wrap(function)

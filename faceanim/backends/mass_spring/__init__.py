@@ -1,0 +1,1 @@
+"""Skin as masses and nonlinear springs (Zhang, Prakash & Sung), with the paper's schemes and better ones."""

@@ -1,0 +1,435 @@
+"""The loops of the time schemes: total force, accelerated sweeps, vertex-by-vertex relaxation, leapfrog.
+
+Notation: m mass [kg], D drag rate [1/s], h time step [s], F force [mN], k stiffness bound [mN/mm]. Every implicit
+scheme solves w (x - c) = F(x) for the free vertices, w and c from `begin`: the minimum of the incremental potential
+w/2 |x - c|^2 + energy(x).
+"""
+
+from __future__ import annotations
+
+import math
+
+from faceanim.ground.jit import kernel
+from faceanim.kernels.attachment import carry, growth, shear_force, tether_force
+from faceanim.kernels.contact import find, plane_force, plane_gap
+from faceanim.kernels.muscles import aim, fibre_force, pull_of
+from faceanim.kernels.springs import elastic_force
+from faceanim.kernels.tangent import height_terms
+
+
+@kernel
+def total_force(x, scene, moment, scratch, force):
+    """Write springs, tethers, muscles and known contacts at `x` (n, 3) into `force` (n, 4)."""
+    elastic_force(x, scene.springs, scene.law, scratch, force)
+    tether_force(x, moment.anchor, scene.tethers, scene.free, force)
+    fibre_force(x, moment, scene.free, force)
+    plane_force(x, moment.planes, scene.colliders.stiffening, force)
+
+
+@kernel
+def gather(q, qd, nodes, held, moment, x, v):
+    """Copy positions and velocities of `nodes` (n,) into `x`, `v` (n, 3); those held by bones go where the bones are."""
+    for i in range(len(nodes)):
+        j = nodes[i]
+        for d in range(3):
+            if held[i]:
+                x[i, d] = moment.anchor[i, d]
+                v[i, d] = 0.0
+            else:
+                x[i, d] = q[j, d]
+                v[i, d] = qd[j, d]
+
+
+@kernel
+def scatter(x, v, nodes, m, q, qd):
+    """Copy positions and velocities of the first `m` of `nodes` from `x`, `v` (n, 3) back into the body's `q`, `qd`."""
+    for i in range(m):
+        for d in range(3):
+            q[nodes[i], d] = x[i, d]
+            qd[nodes[i], d] = v[i, d]
+
+
+@kernel
+def put(place, q, nodes, h, q_new, qd_new):
+    """Write `place` (p, 3) as the new positions of `nodes`, and the velocities that lead there from `q` in `h`."""
+    for i in range(len(nodes)):
+        for d in range(3):
+            qd_new[nodes[i], d] = (place[i, d] - q[nodes[i], d]) / h
+            q_new[nodes[i], d] = place[i, d]
+
+
+@kernel
+def extrapolate(x, v, h):
+    """Move `x` (n, 3) on by h v."""
+    for i in range(len(x)):
+        for d in range(3):
+            x[i, d] += h * v[i, d]
+
+
+@kernel
+def begin(q, qd, q_before, qd_before, nodes, mass, m, drag, gamma, now, before, centre, weight):
+    """Write c (n, 3) and w (n,) of an implicit step for the first `m` of `nodes`.
+
+    x' = now x + before x_before + gamma v', v' likewise: Euler (1, 0, h) or BDF2.
+    """
+    for i in range(m):
+        j = nodes[i]
+        weight[i] = mass[i] * (1.0 + drag * gamma) / (gamma * gamma)
+        for d in range(3):
+            x = now * q[j, d] + before * q_before[j, d]
+            v = now * qd[j, d] + before * qd_before[j, d]
+            centre[i, d] = x + gamma * v / (1.0 + drag * gamma)
+
+
+@kernel
+def finish(x, q, q_before, nodes, m, gamma, now, before, q_out, qd_out):
+    """Write positions and BDF velocities of the first `m` of `nodes` into the body's `q_out`, `qd_out`."""
+    for i in range(m):
+        j = nodes[i]
+        for d in range(3):
+            qd_out[j, d] = (x[i, d] - now * q[j, d] - before * q_before[j, d]) / gamma
+            q_out[j, d] = x[i, d]
+
+
+@kernel
+def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, sweeps, tolerance, force, move):
+    """Jacobi sweeps with Chebyshev acceleration on w (x - c) = F(x), in place.
+
+    Each sweep divides every vertex's residual by w + k, with the k of the moment: stiffening and new contacts count
+    at once. [low, high] : the eigenvalues to damp, of the matrix so scaled (at most 2)
+    force : (n, 4), move : (n, 3) work   tolerance : stop when no vertex wants to go farther [mm]
+    Returns (sweeps made, largest residual [mN], largest wish [mm]) of the last sweep, before it moved.
+    """
+    middle = 0.5 * (high + low)
+    half = 0.5 * (high - low)
+    rho = half / middle
+    residual = 0.0
+    wish = 0.0
+    for sweep in range(sweeps):
+        total_force(x, scene, moment, scratch, force)
+        if sweep == 0:
+            keep = 0.0
+            gain = 1.0 / middle
+        else:
+            new = 1.0 / (2.0 * middle / half - rho)
+            keep = rho * new
+            gain = 2.0 * new / half
+            rho = new
+        residual = 0.0
+        wish = 0.0
+        for i in range(scene.free):
+            s = 1.0 / (weight[i] + force[i, 3])
+            gx = force[i, 0] - weight[i] * (x[i, 0] - centre[i, 0])
+            gy = force[i, 1] - weight[i] * (x[i, 1] - centre[i, 1])
+            gz = force[i, 2] - weight[i] * (x[i, 2] - centre[i, 2])
+            r = gx * gx + gy * gy + gz * gz
+            residual = max(residual, r)
+            wish = max(wish, r * s * s)
+            s *= gain
+            move[i, 0] = keep * move[i, 0] + s * gx
+            move[i, 1] = keep * move[i, 1] + s * gy
+            move[i, 2] = keep * move[i, 2] + s * gz
+            x[i, 0] += move[i, 0]
+            x[i, 1] += move[i, 1]
+            x[i, 2] += move[i, 2]
+        if wish < tolerance * tolerance:
+            return sweep + 1, math.sqrt(residual), math.sqrt(wish)
+    return sweeps, math.sqrt(residual), math.sqrt(wish)
+
+
+@kernel(inline=True)
+def edge_pull(px, py, pz, x, j, rest, stiffness, law):
+    """Return the force on a vertex at p by the structural spring to vertex `j`, its tangent and its secant stiffness."""
+    dx = px - x[j, 0]
+    dy = py - x[j, 1]
+    dz = pz - x[j, 2]
+    l = math.sqrt(dx * dx + dy * dy + dz * dz)
+    s = l - rest
+    secant, tangent = growth((s / law.s0) ** 2, law.alpha)
+    f = -stiffness * secant * s / l
+    return f * dx, f * dy, f * dz, stiffness * tangent, -f
+
+
+@kernel(inline=True)
+def height_push(ix, iy, iz, ax, ay, az, bx, by, bz, rest, stiffness, repulsion, law):
+    """Return force on corner i over edge (a, b), the foot's place t, tangent and secant stiffness of a repulsion spring."""
+    ex = bx - ax
+    ey = by - ay
+    ez = bz - az
+    nx = ix - ax
+    ny = iy - ay
+    nz = iz - az
+    t = (nx * ex + ny * ey + nz * ez) / (ex * ex + ey * ey + ez * ez)
+    nx -= t * ex
+    ny -= t * ey
+    nz -= t * ez
+    h = math.sqrt(nx * nx + ny * ny + nz * nz)
+    first, second = height_terms(h, rest, stiffness, repulsion, law)
+    f = -first / h
+    return f * nx, f * ny, f * nz, t, max(second, abs(f)), -f
+
+
+@kernel
+def vertex_force(i, px, py, pz, x, scene, moment):
+    """Return the force on free vertex `i` if it were at p and the others at `x`, its stiffness bound and secant sum.
+
+    (fx, fy, fz, k, k_secant): springs, tether and muscles; contacts not. The secant sum is the paper's (Eq. 18), which
+    a compressed spring makes negative.
+    """
+    springs = scene.springs
+    law = scene.law
+    total = springs.a.size
+    fx = 0.0
+    fy = 0.0
+    fz = 0.0
+    k = 0.0
+    ks = 0.0
+    for at in range(springs.corner_start[i], springs.corner_start[i + 1]):
+        slot = springs.corner[at]
+        c0 = slot // total
+        q = slot - c0 * total
+        if c0 == 0:
+            j, l, c1, c2 = springs.b[q], springs.c[q], 1, 2
+        elif c0 == 1:
+            j, l, c1, c2 = springs.c[q], springs.a[q], 2, 0
+        else:
+            j, l, c1, c2 = springs.a[q], springs.b[q], 0, 1
+        ux, uy, uz, kt, s = edge_pull(
+            px, py, pz, x, j, springs.edge_length[c2, q], springs.edge_stiffness[c2, q], law
+        )
+        vx, vy, vz, kv, sv = edge_pull(
+            px, py, pz, x, l, springs.edge_length[c1, q], springs.edge_stiffness[c1, q], law
+        )
+        fx += ux + vx
+        fy += uy + vy
+        fz += uz + vz
+        k += kt + kv
+        ks += s + sv
+        jx, jy, jz = x[j, 0], x[j, 1], x[j, 2]
+        lx, ly, lz = x[l, 0], x[l, 1], x[l, 2]
+        ux, uy, uz, t, kt, s = height_push(
+            px, py, pz, jx, jy, jz, lx, ly, lz,
+            springs.height[c0, q], springs.height_stiffness[c0, q], springs.repulsion[c0, q], law,
+        )  # fmt: skip
+        fx += ux
+        fy += uy
+        fz += uz
+        k += 0.5 * (1.0 + abs(t) + abs(1.0 - t)) * kt
+        ks += s
+        if law.reaction:
+            ux, uy, uz, t, kt, s = height_push(
+                jx, jy, jz, lx, ly, lz, px, py, pz,
+                springs.height[c1, q], springs.height_stiffness[c1, q], springs.repulsion[c1, q], law,
+            )  # fmt: skip
+            fx -= t * ux
+            fy -= t * uy
+            fz -= t * uz
+            k += 0.5 * abs(t) * (1.0 + abs(t) + abs(1.0 - t)) * kt
+            ks += t * t * s
+            ux, uy, uz, t, kt, s = height_push(
+                lx, ly, lz, px, py, pz, jx, jy, jz,
+                springs.height[c2, q], springs.height_stiffness[c2, q], springs.repulsion[c2, q], law,
+            )  # fmt: skip
+            t = 1.0 - t
+            fx -= t * ux
+            fy -= t * uy
+            fz -= t * uz
+            k += 0.5 * abs(t) * (1.0 + abs(t) + abs(1.0 - t)) * kt
+            ks += t * t * s
+    if scene.tethers.stiffness[i] > 0.0:
+        dx = px - moment.anchor[i, 0]
+        dy = py - moment.anchor[i, 1]
+        dz = pz - moment.anchor[i, 2]
+        secant, tangent = growth(
+            (dx * dx + dy * dy + dz * dz) / (scene.tethers.s0 * scene.tethers.s0), scene.tethers.alpha
+        )
+        secant *= scene.tethers.stiffness[i]
+        fx -= secant * dx
+        fy -= secant * dy
+        fz -= secant * dz
+        k += scene.tethers.stiffness[i] * tangent
+        ks += secant
+    sx, sy, sz, shear = shear_force(i, px, py, pz, x, moment.anchor, scene.tethers)
+    fx += sx
+    fy += sy
+    fz += sz
+    k += shear
+    ks += shear
+    for e in range(moment.first[i], moment.first[i + 1]):
+        ux, uy, uz, kt = pull_of(e, px, py, pz, moment)
+        fx += ux
+        fy += uy
+        fz += uz
+        k += kt
+    return fx, fy, fz, k, ks
+
+
+@kernel
+def contact_chains(planes, head, link):
+    """Chain the contacts of each vertex: `head` (n,) its first (contact, slot) as 4 c + slot, `link` (4 c,) the next."""
+    head[:] = -1
+    for c in range(planes.count[0]):
+        for k in range(4 if planes.node[c, 1] >= 0 else 1):
+            i = planes.node[c, k]
+            link[4 * c + k] = head[i]
+            head[i] = 4 * c + k
+
+
+@kernel
+def chained_contacts(i, x, planes, stiffening, head, link):
+    """Return force and stiffness bound on vertex `i` by its contacts at `x`."""
+    fx = 0.0
+    fy = 0.0
+    fz = 0.0
+    k = 0.0
+    at = head[i]
+    while at >= 0:
+        c = at // 4
+        slot = at - 4 * c
+        p = -plane_gap(x, planes, c)
+        if p > 0.0:
+            q = (p / stiffening) ** 2
+            w = 1.0 if slot == 0 else -planes.weight[c, slot - 1]
+            f = w * planes.stiffness[c] * p * (1.0 + q)
+            fx += f * planes.normal[c, 0]
+            fy += f * planes.normal[c, 1]
+            fz += f * planes.normal[c, 2]
+            k += abs(w) * planes.stiffness[c] * (1.0 + 3.0 * q) * (1.0 if planes.node[c, 1] < 0 else 2.0)
+        at = link[at]
+    return fx, fy, fz, k
+
+
+@kernel
+def sweep_in_place(x, first, last, scene, moment, weight, centre, omega, head, link):
+    """One pass x_i += omega F_i / (w_i + k_i) over the vertices `first`..`last` - 1, each seeing the ones before it.
+
+    Returns the largest squared residual [mN^2] and wish [mm^2].
+    """
+    residual = 0.0
+    wish = 0.0
+    for i in range(first, last):
+        fx, fy, fz, k, _ = vertex_force(i, x[i, 0], x[i, 1], x[i, 2], x, scene, moment)
+        cx, cy, cz, ck = chained_contacts(i, x, moment.planes, scene.colliders.stiffening, head, link)
+        fx += cx - weight[i] * (x[i, 0] - centre[i, 0])
+        fy += cy - weight[i] * (x[i, 1] - centre[i, 1])
+        fz += cz - weight[i] * (x[i, 2] - centre[i, 2])
+        r = fx * fx + fy * fy + fz * fz
+        s = 1.0 / (weight[i] + k + ck)
+        residual = max(residual, r)
+        wish = max(wish, r * s * s)
+        s *= omega
+        x[i, 0] += s * fx
+        x[i, 1] += s * fy
+        x[i, 2] += s * fz
+    return residual, wish
+
+
+@kernel
+def paper_step(x, v, ahead, scene, moment, mass, drag, h, secant, force, head, link):
+    """Eqs. 18-19 of Zhang, Prakash & Sung with the signs repaired: own position now, the neighbours' extrapolated.
+
+    ahead : (n, 3) work   force : (n, 4) work   secant : 1 = the paper's denominator, 0 = with tangent stiffnesses
+    Returns the largest residual [mN].
+    """
+    for i in range(len(x)):
+        for d in range(3):
+            ahead[i, d] = x[i, d] + h * v[i, d]
+    worst = 0.0
+    for i in range(scene.free):
+        fx, fy, fz, k, ks = vertex_force(i, x[i, 0], x[i, 1], x[i, 2], ahead, scene, moment)
+        cx, cy, cz, ck = chained_contacts(i, x, moment.planes, scene.colliders.stiffening, head, link)
+        force[i, 0] = fx + cx
+        force[i, 1] = fy + cy
+        force[i, 2] = fz + cz
+        force[i, 3] = (ks if secant else k) + ck
+    for i in range(scene.free):
+        s = 1.0 / (mass[i] * (1.0 + h * drag) + h * h * force[i, 3])
+        worst = max(worst, force[i, 0] ** 2 + force[i, 1] ** 2 + force[i, 2] ** 2)
+        for d in range(3):
+            v[i, d] = s * (mass[i] * v[i, d] + h * force[i, d])
+            x[i, d] += h * v[i, d]
+    return math.sqrt(worst)
+
+
+@kernel
+def semi_implicit_step(x, v, scene, moment, scratch, mass, drag, h, force):
+    """The per-node implicit step with the neighbours where they are: stable for every h, slow modes lag.
+
+    (m + h m D + h^2 k) v' = m v + h F(x). Returns the largest residual [mN].
+    """
+    total_force(x, scene, moment, scratch, force)
+    worst = 0.0
+    for i in range(scene.free):
+        s = 1.0 / (mass[i] * (1.0 + h * drag) + h * h * force[i, 3])
+        worst = max(worst, force[i, 0] ** 2 + force[i, 1] ** 2 + force[i, 2] ** 2)
+        for d in range(3):
+            v[i, d] = s * (mass[i] * v[i, d] + h * force[i, d])
+            x[i, d] += h * v[i, d]
+    return math.sqrt(worst)
+
+
+@kernel
+def substeps_needed(x, scene, moment, scratch, mass, drag, h, safety, force):
+    """Return into how many equal substeps leapfrog must divide `h` at the present stiffness.
+
+    With drag D integrated exactly, a mode of stiffness lambda is stable if h tanh(D h / 2) lambda < 2 D m; lambda is
+    at most 2 k.
+    """
+    total_force(x, scene, moment, scratch, force)
+    worst = 0.0
+    for i in range(scene.free):
+        worst = max(worst, 2.0 * force[i, 3] / mass[i])
+    for n in range(1, 1000000):
+        s = h / n
+        damping = math.tanh(0.5 * drag * s) / drag if drag > 0.0 else 0.5 * s
+        if s * damping * worst < 2.0 * safety:
+            return n
+    return 1000000
+
+
+@kernel
+def blend(a, b, share, out):
+    """Write a + share (b - a) into `out`, for flat arrays."""
+    for i in range(len(out)):
+        out[i] = a[i] + share * (b[i] - a[i])
+
+
+@kernel
+def at_share(start, end, share, work, scene, moment):
+    """Set muscles and bones to where they are a `share` of the step after its start."""
+    blend(start.activation, end.activation, share, work.activation)
+    blend(start.pose.reshape(-1), end.pose.reshape(-1), share, moment.pose.reshape(-1))
+    carry(scene.tethers, moment.pose, moment.anchor)
+    aim(scene.fibres, work.activation, moment.pose, moment)
+
+
+@kernel
+def leapfrog(x, v, held, start, end, work, scene, moment, scratch, mass, drag, h, substeps, reach, force):
+    """Kick - drift - kick with exact drag, `substeps` times h / substeps; `force` must hold the forces at `x`.
+
+    start, end, work : `Drive`s at both ends of the step, between which bones and muscles go evenly
+    held : (n,) vertices that go with the bones. Returns the largest force [mN].
+    """
+    s = h / substeps
+    decay = math.exp(-0.5 * drag * s)
+    gain = (1.0 - decay) / drag if drag > 0.0 else 0.5 * s
+    worst = 0.0
+    for n in range(substeps):
+        for i in range(scene.free):
+            for d in range(3):
+                v[i, d] = decay * v[i, d] + gain * force[i, d] / mass[i]
+                x[i, d] += s * v[i, d]
+        at_share(start, end, (n + 1.0) / substeps, work, scene, moment)
+        for i in range(scene.free, len(x)):
+            if held[i]:
+                for d in range(3):
+                    x[i, d] = moment.anchor[i, d]
+        if n % 8 == 7:
+            find(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)
+        total_force(x, scene, moment, scratch, force)
+        worst = 0.0
+        for i in range(scene.free):
+            worst = max(worst, force[i, 0] ** 2 + force[i, 1] ** 2 + force[i, 2] ** 2)
+            for d in range(3):
+                v[i, d] = decay * v[i, d] + gain * force[i, d] / mass[i]
+    return math.sqrt(worst)

@@ -1,0 +1,64 @@
+"""A patch under a control: where the bones carry it, how the muscles pull it, what it touches; and its forces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from faceanim.backends.mass_spring import build, kernels
+from faceanim.backends.mass_spring.build import Patch
+from faceanim.backends.solver import Energy
+from faceanim.body.control import Control
+from faceanim.ground.arrays import Floats
+from faceanim.kernels import attachment, contact, muscles
+from faceanim.kernels.springs import elastic_energy, force_scratch
+from faceanim.kernels.tables import Moment
+
+
+class Load:
+    """The work space of one patch and the boundary conditions that a control sets on it.
+
+    x : (n, 3) positions [mm]   force : (n, 4) forces [mN] and stiffness bounds [mN/mm]   moment : see `Moment`
+    """
+
+    def __init__(self, patch: Patch) -> None:
+        n, e = len(patch.nodes), len(patch.scene.fibres.muscle)
+        self.patch = patch
+        self.x = np.zeros((n, 3))
+        self.force = np.zeros((n, 4))
+        pose = np.zeros((patch.scene.tethers.bone_weight.shape[1], 4, 4))
+        planes = build.room_for_planes(patch.scene.colliders, n)
+        self.moment = Moment(
+            np.zeros((n, 3)), pose, np.zeros(n + 1, dtype=np.int32), np.zeros((e, 3)), np.zeros(e), np.zeros(e), planes
+        )
+        self.activation = np.zeros(patch.muscles)
+        self.scratch = force_scratch(patch.scene.springs)
+
+    def apply(self, control: Control) -> None:
+        """Carry the anchors by the bones and aim the muscles."""
+        scene, moment = self.patch.scene, self.moment
+        if not np.array_equal(moment.pose, control.bone_pose):
+            moment.pose[:] = control.bone_pose
+            attachment.carry(scene.tethers, moment.pose, moment.anchor)
+        self.activation[:] = control.activation
+        muscles.aim(scene.fibres, control.activation, moment.pose, moment)
+
+    def touch(self, x: Floats, reach: float) -> None:
+        """Find the contacts nearer than `reach` [mm] at `x`."""
+        scene = self.patch.scene
+        contact.find(x, scene.colliders, scene.grids, self.moment.pose, reach, self.moment.planes)
+
+    def forces(self, x: Floats) -> Floats:
+        """Return the forces at `x` with the stiffness bounds, (n, 4): springs, tethers, muscles and known contacts."""
+        kernels.total_force(x, self.patch.scene, self.moment, self.scratch, self.force)
+        return self.force
+
+    def energy(self, x: Floats) -> Energy:
+        """Return the energies at `x`, without the kinetic part; of the contacts those found last."""
+        scene, moment, m = self.patch.scene, self.moment, self.patch.m
+        return Energy(
+            kinetic=0.0,
+            elastic=elastic_energy(x, scene.springs, scene.law),
+            attachment=attachment.tether_energy(x, moment.anchor, scene.tethers, m),
+            contact=contact.plane_energy(x, moment.planes, scene.colliders.stiffening),
+            muscle=muscles.fibre_energy(x, moment, m),
+        )

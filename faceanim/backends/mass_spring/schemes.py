@@ -1,0 +1,295 @@
+"""The time schemes: each advances the free vertices of one patch by one step."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from faceanim.backends.mass_spring import kernels
+from faceanim.backends.mass_spring.load import Load
+from faceanim.backends.mass_spring.newton import Newton
+from faceanim.backends.mass_spring.options import Options
+from faceanim.backends.solver import StepReport
+from faceanim.ground.arrays import Floats
+from faceanim.kernels.tables import Drive
+
+REACH = 2.0
+"""Contacts within this distance [mm] of their clearance are watched during a step."""
+HIGHEST = 2.0
+"""No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
+SETTLED = 0.02
+"""A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
+OMEGA = 1.5
+"""Relaxation factor of the passes in wave order."""
+
+
+class Motion:
+    """What a scheme reads and writes: the body's positions and velocities, now, one step earlier and new, (n, 3).
+
+    `t` [s] is the time now, `dt_before` [s] the earlier step, 0 = there is none.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.q = self.qd = self.q_before = self.qd_before = np.zeros((0, 3))
+        self.t = self.dt_before = 0.0
+        self.q_new = np.zeros((n, 3))
+        self.qd_new = np.zeros((n, 3))
+
+
+class Scheme(Protocol):
+    """A way to advance one patch; `advance` fills `report` and writes the free vertices of `motion.q_new`, `qd_new`."""
+
+    load: Load
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None: ...
+
+
+class _Patchwise:
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        n = len(load.patch.nodes)
+        self.load = load
+        self.drag = drag
+        self.options = options
+        self.v = np.zeros((n, 3))
+
+    def _gather(self, motion: Motion) -> None:
+        patch = self.load.patch
+        kernels.gather(motion.q, motion.qd, patch.nodes, patch.held, self.load.moment, self.load.x, self.v)
+
+    def _scatter(self, motion: Motion) -> None:
+        kernels.scatter(self.load.x, self.v, self.load.patch.nodes, self.load.patch.m, motion.q_new, motion.qd_new)
+
+
+class _Implicit(_Patchwise):
+    """Common to the schemes that solve w (x - c) = F(x)."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        n = len(load.patch.nodes)
+        self.weight = np.zeros(n)
+        self.centre = np.zeros((n, 3))
+
+    def _coefficients(self, motion: Motion, h: float) -> tuple[float, float, float]:
+        """Return gamma [s] and the shares of the last two steps: BDF2 for variable steps, or Euler."""
+        if self.options.integrator == "euler" or motion.dt_before <= 0.0:
+            return h, 1.0, 0.0
+        ratio = h / motion.dt_before
+        share = 1.0 + 2.0 * ratio
+        return h * (1.0 + ratio) / share, (1.0 + ratio) ** 2 / share, -(ratio**2) / share
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None:
+        """Set up the incremental potential, minimise it, and read the velocities off."""
+        patch, x = self.load.patch, self.load.x
+        gamma, now, before = self._coefficients(motion, h)
+        self._gather(motion)
+        kernels.begin(
+            motion.q, motion.qd, motion.q_before, motion.qd_before, patch.nodes, patch.mass, patch.m, self.drag, gamma,
+            now, before, self.centre, self.weight,
+        )  # fmt: skip
+        kernels.extrapolate(x, self.v, h)
+        self.load.touch(x, REACH)
+        self._minimise(gamma, report)
+        kernels.finish(
+            x, motion.q, motion.q_before, patch.nodes, patch.m, gamma, now, before, motion.q_new, motion.qd_new
+        )
+
+    def _minimise(self, gamma: float, report: StepReport) -> None:
+        raise NotImplementedError
+
+
+class BlockDescent(_Implicit):
+    """Implicit step by a fixed number of Chebyshev-accelerated Jacobi sweeps (or fewer, when nothing moves)."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        self.move = np.zeros_like(self.centre)
+        self.stiffness = rest_stiffness(load)
+        self._gamma = self._low = 0.0
+
+    def _minimise(self, gamma: float, report: StepReport) -> None:
+        load, options = self.load, self.options
+        if gamma != self._gamma:
+            self._gamma, self._low = gamma, lowest(load, self.weight, self.stiffness, options.sweeps)
+        sweeps, residual, wish = kernels.accelerated_sweeps(
+            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self._low, HIGHEST,
+            options.sweeps, options.sweep_tolerance, load.force, self.move,
+        )  # fmt: skip
+        report.iterations += sweeps
+        report.residual = max(report.residual, residual)
+        report.converged = report.converged and wish < SETTLED
+
+
+class QuasiStatic(_Patchwise):
+    """Passes over V_q along the residual force, without inertia or drag: w = 0 in the implicit step."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        n = len(load.patch.nodes)
+        self.weight = np.zeros(n)
+        self.centre = np.zeros((n, 3))
+        self.move = np.zeros((n, 3))
+        self.head = np.full(n, -1, dtype=np.int32)
+        self.link = np.zeros(4 * len(load.moment.planes.offset), dtype=np.int32)
+        self.low = lowest(load, self.weight, rest_stiffness(load), options.passes)
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None:
+        """Move the free vertices after those of `motion.q_new`, which have gone ahead."""
+        load, patch, x = self.load, self.load.patch, self.load.x
+        kernels.gather(motion.q_new, motion.qd, patch.nodes, patch.held, load.moment, x, self.v)
+        self.v[patch.m :] = 0.0
+        kernels.extrapolate(x, self.v, h)
+        load.touch(x, REACH)
+        options, scene = self.options, patch.scene
+        if options.quasi_static == "chebyshev":
+            kernels.accelerated_sweeps(
+                x, scene, load.moment, load.scratch, self.weight, self.centre, self.low, HIGHEST, options.passes,
+                options.sweep_tolerance, load.force, self.move,
+            )  # fmt: skip
+        else:
+            kernels.contact_chains(load.moment.planes, self.head, self.link)
+            for _ in range(options.passes):
+                kernels.sweep_in_place(
+                    x, 0, patch.m, scene, load.moment, self.weight, self.centre, OMEGA, self.head, self.link
+                )
+        kernels.put(x, motion.q, patch.nodes[: patch.m], h, motion.q_new, motion.qd_new)
+
+
+class FullNewton(_Implicit):
+    """The same step solved to the end."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        self.newton = Newton(load)
+
+    def _minimise(self, gamma: float, report: StepReport) -> None:
+        done = self.newton.minimise(
+            self.load.x, weight=self.weight, centre=self.centre, tolerance=self.options.newton_tolerance,
+            most=self.options.newton_most,
+        )  # fmt: skip
+        report.iterations += done.steps
+        report.residual = max(report.residual, done.residual)
+        report.converged = report.converged and done.converged
+
+
+class SemiImplicit(_Patchwise):
+    """Per-node implicit update, neighbours at their present place: stable for every step, slow modes lag."""
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None:
+        """Advance by one step."""
+        load = self.load
+        self._gather(motion)
+        load.touch(load.x, REACH)
+        residual = kernels.semi_implicit_step(
+            load.x, self.v, load.patch.scene, load.moment, load.scratch, load.patch.mass, self.drag, h, load.force
+        )
+        self._scatter(motion)
+        report.iterations += 1
+        report.residual = max(report.residual, residual)
+
+
+class Paper(_Patchwise):
+    """Eqs. 18-19 as printed, signs repaired: neighbours extrapolated, secant stiffness. Unstable for large steps."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        self.ahead = np.zeros_like(load.x)
+        self.head = np.full(len(load.x), -1, dtype=np.int32)
+        self.link = np.zeros(4 * len(load.moment.planes.offset), dtype=np.int32)
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None:
+        """Advance by one step."""
+        load = self.load
+        self._gather(motion)
+        load.touch(load.x, REACH)
+        kernels.contact_chains(load.moment.planes, self.head, self.link)
+        residual = kernels.paper_step(
+            load.x, self.v, self.ahead, load.patch.scene, load.moment, load.patch.mass, self.drag, h,
+            int(self.options.secant), load.force, self.head, self.link,
+        )  # fmt: skip
+        self._scatter(motion)
+        report.iterations += 1
+        report.residual = max(report.residual, residual)
+
+
+class Explicit(_Patchwise):
+    """Leapfrog, divided into as many substeps as the present stiffness asks for.
+
+    Bones and muscles go evenly from where the last step left them to the control, which holds at the step's end.
+    """
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        shapes = load.activation.shape, load.moment.pose.shape
+        self.start, self.end, self.work = (Drive(np.zeros(shapes[0]), np.zeros(shapes[1])) for _ in range(3))
+        self.reached = np.nan
+
+    def advance(self, motion: Motion, h: float, report: StepReport) -> None:
+        """Advance by one step."""
+        load, patch = self.load, self.load.patch
+        self._gather(motion)
+        np.take(motion.q, patch.nodes, axis=0, out=load.x, mode="clip")
+        self.end.activation[:] = load.activation
+        self.end.pose[:] = load.moment.pose
+        if motion.t != self.reached:
+            self._stand(self.end)
+        kernels.at_share(self.start, self.end, 0.0, self.work, patch.scene, load.moment)
+        load.touch(load.x, REACH)
+        substeps = kernels.substeps_needed(
+            load.x, patch.scene, load.moment, load.scratch, patch.mass, self.drag, h, self.options.safety, load.force
+        )
+        residual = kernels.leapfrog(
+            load.x, self.v, patch.held, self.start, self.end, self.work, patch.scene, load.moment, load.scratch,
+            patch.mass, self.drag, h, substeps, REACH, load.force,
+        )  # fmt: skip
+        self._stand(self.end)
+        self.reached = motion.t + h
+        self._scatter(motion)
+        report.iterations += substeps
+        report.residual = max(report.residual, residual)
+
+    def _stand(self, drive: Drive) -> None:
+        self.start.activation[:] = drive.activation
+        self.start.pose[:] = drive.pose
+
+    def largest_step(self) -> float:
+        """Return the largest stable step at rest [s]."""
+        load, patch = self.load, self.load.patch
+        load.x[:] = patch.scene.tethers.rest
+        load.touch(load.x, 0.0)
+        pieces = kernels.substeps_needed(
+            load.x, patch.scene, load.moment, load.scratch, patch.mass, self.drag, 1.0, self.options.safety, load.force
+        )
+        return 1.0 / float(pieces)
+
+
+SCHEMES: dict[str, type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | type[Paper] | type[Explicit]] = {
+    "paper": Paper,
+    "semi_implicit": SemiImplicit,
+    "block_descent": BlockDescent,
+    "explicit": Explicit,
+    "newton": FullNewton,
+}
+
+
+def rest_stiffness(load: Load) -> Floats:
+    """Return the stiffness bound of every vertex of a patch at rest, (n,) [mN/mm]."""
+    load.x[:] = load.patch.scene.tethers.rest
+    load.touch(load.x, 0.0)
+    return load.forces(load.x)[:, 3].copy()
+
+
+def lowest(load: Load, weight: Floats, stiffness: Floats, sweeps: int) -> float:
+    """Return the lower end of the eigenvalues that `sweeps` sweeps should damp.
+
+    That is what inertia and tethers hold of a vertex's whole stiffness, but no less than so few sweeps can resolve.
+    """
+    m = load.patch.m
+    held = weight[:m] + load.patch.scene.tethers.stiffness[:m]
+    share = float(np.median(held / (weight[:m] + stiffness[:m]))) if m else 1.0
+    return min(0.9 * HIGHEST, max(share, HIGHEST * (2.0 / max(sweeps, 3)) ** 2))
+
+
+def make_scheme(load: Load, drag: float, options: Options) -> Scheme:
+    """Return the scheme that `options` names, bound to one patch."""
+    return SCHEMES[options.scheme](load, drag, options)

@@ -1,0 +1,288 @@
+"""The mass-spring backend behind the `Solver` protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+
+from faceanim.backends.mass_spring import kernels, partition
+from faceanim.backends.mass_spring.build import Tables
+from faceanim.backends.mass_spring.load import Load
+from faceanim.backends.mass_spring.newton import Newton, NewtonReport
+from faceanim.backends.mass_spring.options import Options
+from faceanim.backends.mass_spring.partition import Partition, content_key
+from faceanim.backends.mass_spring.schemes import Explicit, Motion, QuasiStatic, make_scheme
+from faceanim.backends.solver import Energy, State, StepReport
+from faceanim.body.body import Body
+from faceanim.body.control import Control
+from faceanim.ground.arrays import Floats, Ints
+from faceanim.ground.errors import DivergenceError, UserError
+from faceanim.kernels import attachment
+from faceanim.kernels.tables import Tethers
+
+
+@dataclass(eq=False)
+class StateMassSpring(State):
+    """Positions `q` (n, 3) [mm] and velocities `qd` (n, 3) [mm/s], with the step before for two-step schemes.
+
+    q_before, qd_before : the same one step earlier;  dt_before : that step [s], 0 = none yet
+    """
+
+    q_before: Floats | None = None
+    qd_before: Floats | None = None
+    dt_before: float = 0.0
+
+    def copy(self) -> StateMassSpring:
+        """Return an independent copy."""
+        before = [None if a is None else a.copy() for a in (self.q_before, self.qd_before)]
+        return StateMassSpring(self.q.copy(), self.qd.copy(), self.t, before[0], before[1], self.dt_before)
+
+
+class Pins:
+    """The vertices that the bones carry rigidly: `node` (p,)."""
+
+    def __init__(self, body: Body) -> None:
+        self.node = np.flatnonzero(body.pinned).astype(np.int32)
+        self.table = Tethers(
+            body.surface.points[self.node], np.ascontiguousarray(body.attachment.bone_weight[self.node]),
+            np.zeros(len(self.node)), 1.0, 1.0, np.zeros(len(self.node) + 1, dtype=np.int32),
+            np.zeros(0, dtype=np.int32), np.zeros(0),
+        )  # fmt: skip
+        self.pose = np.zeros((len(body.bones), 4, 4))
+        self.place = np.zeros((len(self.node), 3))
+
+    def places(self, control: Control) -> Floats:
+        """Return where the bones carry them, (p, 3) [mm]."""
+        if not np.array_equal(self.pose, control.bone_pose):
+            self.pose[:] = control.bone_pose
+            attachment.carry(self.table, self.pose, self.place)
+        return self.place
+
+    def move(self, control: Control, motion: Motion, h: float) -> None:
+        """Write their new positions and velocities into `motion`."""
+        kernels.put(self.places(control), motion.q, self.node, h, motion.q_new, motion.qd_new)
+
+
+class SolverMassSpring:
+    """Masses and nonlinear springs under muscles, bones and contact.
+
+    See `Options` for the schemes. `dt_max` [s] is infinite except for "explicit": its largest stable step at rest
+    (larger ones are divided).
+    """
+
+    Options: ClassVar[type] = Options
+
+    def __init__(self, body: Body, options: Any = None) -> None:
+        self.body = body
+        self.options: Options = Options() if options is None else options
+        self.tables = Tables(body)
+        self.dt_max = np.inf
+        self.static_report = NewtonReport()
+        self.pins = Pins(body)
+        self._motion = Motion(len(body.surface.points))
+        self._horizon = 1000.0 + 2.0 * float(np.abs(body.surface.points).max(initial=0.0))
+        self._free = np.flatnonzero(~body.pinned).astype(np.int32)
+        self._statics: Newton | None = None
+        self._everything: Load | None = None
+        self.partition: Partition | None = None
+        self._dynamic = make_scheme(Load(self.tables.patch(self._free)), body.damping, self.options)
+        self._quasi_static: QuasiStatic | None = None
+        if isinstance(self._dynamic, Explicit):
+            self.dt_max = self._dynamic.largest_step()
+
+    def rest(self) -> StateMassSpring:
+        """Return a new state: the body at rest."""
+        q = self.body.surface.points.copy()
+        return StateMassSpring(q, np.zeros_like(q), 0.0, q.copy(), np.zeros_like(q), 0.0)
+
+    def check(self, control: Control) -> None:
+        """Raise `UserError` unless `control` fits the body and holds only finite numbers."""
+        for name, value, shape in (
+            ("activation", control.activation, (len(self.body.muscles.names),)),
+            ("bone_pose", control.bone_pose, (len(self.body.bones), 4, 4)),
+        ):
+            if np.shape(value) != shape:
+                raise UserError(f"control: {name} has shape {np.shape(value)}; {shape} is needed")
+            if not np.isfinite(value).all():
+                raise UserError(f"control: {name} holds a number that is not finite")
+
+    def surface(self, state: State, out: np.ndarray) -> None:
+        """Write the surface points (n, 3) [mm] into `out`."""
+        out[:] = state.q
+
+    def solve_static(self, control: Control, guess: State | None = None) -> StateMassSpring:
+        """Return the equilibrium under a constant control; `guess` (default: rest, carried by the bones) starts it.
+
+        `static_report` tells how it went (steps, residual, whether it converged). Raises `DivergenceError` when the
+        positions leave the finite numbers.
+        """
+        self.check(control)
+        if self._statics is None:
+            self._statics = self._newton(self._free)
+        return self._settle(self._statics, control, None if guess is None else guess.q)
+
+    def _newton(self, free: Ints) -> Newton:
+        return Newton(Load(self.tables.patch(free)))
+
+    def _settle(self, newton: Newton, control: Control, guess: Floats | None) -> StateMassSpring:
+        """Return the equilibrium of the free vertices of `newton`; the other ones at rest or with their bones."""
+        load, patch = newton.load, newton.load.patch
+        load.apply(control)
+        if guess is None:
+            load.x[:] = load.moment.anchor
+        else:
+            load.x[: patch.m] = guess[patch.nodes[: patch.m]]
+            load.x[patch.m :] = self.body.surface.points[patch.nodes[patch.m :]]
+            load.x[patch.held] = load.moment.anchor[patch.held]
+        report = newton.minimise(load.x, tolerance=self.options.newton_tolerance, most=self.options.newton_most)
+        self.static_report = report
+        if not np.isfinite(report.residual):
+            raise DivergenceError(
+                f"the equilibrium search left the finite numbers after {report.steps} Newton steps; lower the "
+                "activations or check the body for crossings at rest"
+            )
+        state = self.rest()
+        state.q[self.pins.node] = self.pins.places(control)
+        state.q[patch.nodes[: patch.m]] = load.x[: patch.m]
+        return state
+
+    def _whole(self, control: Control) -> Load:
+        """Return all vertices, pinned ones too, under `control`."""
+        if self._everything is None:
+            everyone = np.arange(len(self.body.surface.points), dtype=np.int32)
+            self._everything = Load(self.tables.patch(everyone))
+        self._everything.apply(control)
+        return self._everything
+
+    def forces(self, state: State, control: Control) -> Floats:
+        """Return the force on every vertex, pinned or not, without drag, (n, 3) [mN]; for tests."""
+        self.check(control)
+        load = self._whole(control)
+        load.touch(state.q, 1.0)
+        return load.forces(np.ascontiguousarray(state.q))[:, :3].copy()
+
+    def energy(self, state: State, control: Control) -> Energy:
+        """Return the energies of `state` [uJ]; for tests, never in the frame loop."""
+        self.check(control)
+        load = self._whole(control)
+        load.touch(state.q, 1.0)
+        e = load.energy(np.ascontiguousarray(state.q))
+        kinetic = 0.5 * float((self.body.mass * (state.qd**2).sum(axis=1)).sum())
+        return Energy(kinetic, e.elastic, e.attachment, e.contact, e.muscle)
+
+    def step(self, state_in: State, state_out: State, control: Control, dt: float) -> StepReport:
+        """Advance by `dt` [s]; `state_out` may be `state_in`.
+
+        Raises `UserError` for a control that does not fit, `DivergenceError` when positions leave the finite numbers
+        or run away.
+        """
+        self.check(control)
+        if not (np.isfinite(dt) and dt > 0):
+            raise UserError(f"dt = {dt} s: the step must be positive and finite")
+        report = StepReport()
+        if self.options.adaptive:
+            self._adapt(state_in, control)
+        started = perf_counter()
+        self._recall(state_in)
+        self.pins.move(control, self._motion, dt)
+        self._dynamic.load.apply(control)
+        self._dynamic.advance(self._motion, dt, report)
+        between = perf_counter()
+        if self._quasi_static is not None:
+            self._quasi_static.load.apply(control)
+            self._quasi_static.advance(self._motion, dt, report)
+        done = perf_counter()
+        self._commit(state_in, state_out, dt)
+        report.seconds["dynamic"] = between - started
+        report.seconds["quasi_static"] = done - between
+        report.seconds["rest"] = perf_counter() - done
+        self._watch(state_out, report)
+        return report
+
+    def prepare(self, controls: Control | Sequence[Control]) -> Partition | None:
+        """Compute, or read from the cache, the adaptive partition for these peak controls, and use it from now on.
+
+        Without `Options(adaptive=True)` there is nothing to prepare: returns None. The union of what they activate is integrated; see `Partition`. A step prepares itself
+        when a muscle or bone acts that no partition was made for, then as if every acting muscle reached 1.
+        """
+        peaks = [controls] if isinstance(controls, Control) else list(controls)
+        for control in peaks:
+            self.check(control)
+        if not self.options.adaptive:
+            return None
+        peaks = peaks or [Control.rest(self.body)]
+        key = content_key(self.body, peaks, self.options.tolerance)
+        found = partition.load(key, len(self.body.mass))
+        if found is None:
+            found = partition.compute(self.body, peaks, self.options.tolerance, self._equilibrium)
+            partition.save(key, found)
+        self.use(found)
+        return found
+
+    def _equilibrium(self, control: Control, free: Ints | None, guess: Floats | None) -> Floats:
+        newton = self._newton(self._free if free is None else free)
+        return self._settle(newton, control, guess).q
+
+    def _adapt(self, state: State, control: Control) -> None:
+        muscles, bones = partition.acting(control)
+        known = self.partition
+        if known is not None and known.covers(muscles, bones):
+            return
+        found = self.prepare(partition.full_blast(control))
+        assert found is not None
+        wide = partition.widened(self.body, found, state.q)
+        if wide is not found:
+            self.use(wide)
+
+    def use(self, found: Partition) -> None:
+        """Use this partition from now on: build the patches of dynamic, and of quasi-static vertices in wave order."""
+        self.partition = found
+        free = ~self.body.pinned
+        dynamic = np.flatnonzero((found.node_set == partition.DYNAMIC) & free).astype(np.int32)
+        quasi = np.flatnonzero((found.node_set == partition.QUASI_STATIC) & free).astype(np.int32)
+        if self.options.quasi_static == "integrated":
+            dynamic, quasi = np.union1d(dynamic, quasi).astype(np.int32), quasi[:0]
+        if self.options.quasi_static == "waves":
+            quasi = quasi[np.argsort(found.wave[quasi], kind="stable")]
+        self._dynamic = make_scheme(Load(self.tables.patch(dynamic)), self.body.damping, self.options)
+        self._quasi_static = None
+        if len(quasi):
+            self._quasi_static = QuasiStatic(Load(self.tables.patch(quasi)), self.body.damping, self.options)
+
+    def _recall(self, state: State) -> None:
+        motion = self._motion
+        motion.q, motion.qd, motion.t = state.q, state.qd, state.t
+        before, rate = getattr(state, "q_before", None), getattr(state, "qd_before", None)
+        known = before is not None and rate is not None
+        motion.q_before, motion.qd_before = (before, rate) if known else (state.q, state.qd)
+        motion.dt_before = getattr(state, "dt_before", 0.0) if known else 0.0
+        motion.q_new[:] = state.q
+        motion.qd_new[:] = 0.0
+
+    def _commit(self, state_in: State, state_out: State, dt: float) -> None:
+        motion = self._motion
+        if isinstance(state_out, StateMassSpring):
+            if state_out.q_before is None or state_out.qd_before is None:
+                state_out.q_before, state_out.qd_before = np.empty_like(state_in.q), np.empty_like(state_in.q)
+            state_out.q_before[:] = state_in.q
+            state_out.qd_before[:] = state_in.qd
+            state_out.dt_before = dt
+        state_out.q[:] = motion.q_new
+        state_out.qd[:] = motion.qd_new
+        state_out.t = state_in.t + dt
+
+    def _watch(self, state: State, report: StepReport) -> None:
+        farthest = float(np.abs(state.q).max(initial=0.0))
+        if not farthest < self._horizon:
+            remedy = {
+                "paper": "this scheme is unstable for large steps: use scheme='block_descent' or a smaller step",
+                "explicit": "lower `safety` or use scheme='block_descent'",
+            }.get(self.options.scheme, "use a smaller step or more sweeps, or lower the activations")
+            raise DivergenceError(
+                f"the skin ran away (farthest vertex {farthest:.3g} mm) at t = {state.t:.4g} s with scheme "
+                f"{self.options.scheme!r} after {report.iterations} iterations; {remedy}"
+            )

@@ -1,0 +1,143 @@
+"""Hypodermis: springs from skin vertices to anchors that the bones carry (see `body.Attachment`).
+
+Energy of one tether of length s: k s0^2 / (2 (alpha + 1)) [(1 + (s/s0)^2)^(alpha + 1) - 1]; force and tangent are its
+first and second derivatives. The shear layer couples the displacements u = x - anchor of neighbours i, j with the
+energy w/2 |u_i - u_j|^2 per edge. All kernels add to what `force` (n, 4) (three components and a stiffness bound) holds.
+"""
+
+from __future__ import annotations
+
+import math
+
+from faceanim.ground.jit import kernel
+from faceanim.kernels.linalg3 import add_identity, add_outer
+
+
+@kernel
+def carry(tethers, pose, anchor):
+    """Write where the bones of `pose` (n_bone, 4, 4) carry each vertex's rest position into `anchor` (n, 3) [mm]."""
+    rest = tethers.rest
+    for i in range(len(rest)):
+        x = rest[i, 0]
+        y = rest[i, 1]
+        z = rest[i, 2]
+        ax = 0.0
+        ay = 0.0
+        az = 0.0
+        for b in range(pose.shape[0]):
+            w = tethers.bone_weight[i, b]
+            if w != 0.0:
+                ax += w * (pose[b, 0, 0] * x + pose[b, 0, 1] * y + pose[b, 0, 2] * z + pose[b, 0, 3])
+                ay += w * (pose[b, 1, 0] * x + pose[b, 1, 1] * y + pose[b, 1, 2] * z + pose[b, 1, 3])
+                az += w * (pose[b, 2, 0] * x + pose[b, 2, 1] * y + pose[b, 2, 2] * z + pose[b, 2, 3])
+        anchor[i, 0] = ax
+        anchor[i, 1] = ay
+        anchor[i, 2] = az
+
+
+@kernel(inline=True)
+def growth(q, alpha):
+    """Return (1 + q)^alpha and its tangent form (1 + q)^(alpha - 1) (1 + (2 alpha + 1) q)."""
+    if alpha == 1.0:
+        return 1.0 + q, 1.0 + 3.0 * q
+    if alpha == 0.0:
+        return 1.0, 1.0
+    p = 1.0 / math.sqrt(1.0 + q) if alpha == 0.5 else (1.0 + q) ** (alpha - 1.0)
+    return p * (1.0 + q), p * (1.0 + (2.0 * alpha + 1.0) * q)
+
+
+@kernel(inline=True)
+def shear_force(i, px, py, pz, x, anchor, tethers):
+    """Return the force of the shear layer on vertex `i` at (px, py, pz) and the sum of its stiffnesses."""
+    px -= anchor[i, 0]
+    py -= anchor[i, 1]
+    pz -= anchor[i, 2]
+    fx = 0.0
+    fy = 0.0
+    fz = 0.0
+    k = 0.0
+    for e in range(tethers.start[i], tethers.start[i + 1]):
+        j = tethers.neighbour[e]
+        w = tethers.shear[e]
+        fx += w * (x[j, 0] - anchor[j, 0] - px)
+        fy += w * (x[j, 1] - anchor[j, 1] - py)
+        fz += w * (x[j, 2] - anchor[j, 2] - pz)
+        k += w
+    return fx, fy, fz, k
+
+
+@kernel
+def tether_force(x, anchor, tethers, m, force):
+    """Add the force on the first `m` vertices and the tangent stiffness along the tether to `force` (n, 4)."""
+    per = 1.0 / (tethers.s0 * tethers.s0)
+    for i in range(m):
+        k = tethers.stiffness[i]
+        if k > 0.0:
+            dx = x[i, 0] - anchor[i, 0]
+            dy = x[i, 1] - anchor[i, 1]
+            dz = x[i, 2] - anchor[i, 2]
+            secant, tangent = growth((dx * dx + dy * dy + dz * dz) * per, tethers.alpha)
+            force[i, 0] -= k * secant * dx
+            force[i, 1] -= k * secant * dy
+            force[i, 2] -= k * secant * dz
+            force[i, 3] += k * tangent
+        fx, fy, fz, k = shear_force(i, x[i, 0], x[i, 1], x[i, 2], x, anchor, tethers)
+        force[i, 0] += fx
+        force[i, 1] += fy
+        force[i, 2] += fz
+        force[i, 3] += k
+
+
+@kernel
+def tether_energy(x, anchor, tethers, m):
+    """Return the energy of the first `m` tethers and of the shear layer between their vertices and the rest [uJ]."""
+    per = 1.0 / (tethers.s0 * tethers.s0)
+    alpha = tethers.alpha
+    total = 0.0
+    for i in range(m):
+        dx = x[i, 0] - anchor[i, 0]
+        dy = x[i, 1] - anchor[i, 1]
+        dz = x[i, 2] - anchor[i, 2]
+        q = (dx * dx + dy * dy + dz * dz) * per
+        if alpha == 1.0:
+            total += tethers.stiffness[i] * q * (0.5 + 0.25 * q)
+        else:
+            total += tethers.stiffness[i] * ((1.0 + q) ** (alpha + 1.0) - 1.0) / (2.0 * (alpha + 1.0))
+    total /= per
+    for i in range(m):
+        for e in range(tethers.start[i], tethers.start[i + 1]):
+            j = tethers.neighbour[e]
+            share = 0.25 if j < m else 0.5
+            for d in range(3):
+                total += share * tethers.shear[e] * (x[i, d] - anchor[i, d] - x[j, d] + anchor[j, d]) ** 2
+    return total
+
+
+@kernel
+def shear_coupling(shear, n_pair, coupling):
+    """Add the shear layer's part of the Hessian to the off-diagonal blocks `coupling` (e, 9) of the first edges."""
+    for e in range(n_pair):
+        coupling[e, 0] -= shear[e]
+        coupling[e, 4] -= shear[e]
+        coupling[e, 8] -= shear[e]
+
+
+@kernel
+def tether_blocks(x, anchor, tethers, m, block):
+    """Add the Hessian of the first `m` tethers and their shear layer, both positive, to the symmetric `block` (n, 6)."""
+    per = 1.0 / (tethers.s0 * tethers.s0)
+    for i in range(m):
+        k = 0.0
+        for e in range(tethers.start[i], tethers.start[i + 1]):
+            k += tethers.shear[e]
+        add_identity(block, i, k)
+        k = tethers.stiffness[i]
+        if k > 0.0:
+            dx = x[i, 0] - anchor[i, 0]
+            dy = x[i, 1] - anchor[i, 1]
+            dz = x[i, 2] - anchor[i, 2]
+            r2 = dx * dx + dy * dy + dz * dz
+            secant, tangent = growth(r2 * per, tethers.alpha)
+            add_identity(block, i, k * secant)
+            if r2 > 0.0:
+                add_outer(block, i, k * (tangent - secant) / r2, dx, dy, dz)
