@@ -1,0 +1,222 @@
+"""The renderer: owns every buffer of a picture and draws frames into them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import gcd, isfinite
+from typing import Any
+
+import numpy as np
+
+from faceanim.ground.arrays import Floats, Ints, floats, ints
+from faceanim.ground.errors import RunError, UserError
+from faceanim.kernels import raster, shade
+from faceanim.render.camera import Camera
+from faceanim.render.shading import Bytes, Look, Material, linear, paint_tables
+from faceanim.render.shadow import ShadowMap, no_shadow
+
+
+@dataclass(frozen=True, eq=False)
+class DrawItem:
+    """One surface of a picture.
+
+    points : (n, 3) [mm], at rest   triangles : (t, 3), counter-clockwise seen from outside
+    uv : (m, 2) in [0, 1], v up, `uv_triangles` (t, 3) indices into it (default: `triangles`)
+    vertex_colour : (n, 3) sRGB in [0, 1]   occlusion : (n,) or one number, how open to light, 1 = fully (default)
+    bone : the bone that carries the surface rigidly, None if its points are given for each frame
+    """
+
+    points: Floats
+    triangles: Ints
+    material: Material
+    uv: Floats | None = None
+    uv_triangles: Ints | None = None
+    vertex_colour: Floats | None = None
+    occlusion: Floats | None = None
+    bone: int | None = None
+
+    def __post_init__(self) -> None:
+        points = floats("points", self.points, None, 3)
+        triangles = ints("triangles", self.triangles, None, 3, below=len(points))
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "triangles", triangles)
+        if self.uv is None and self.material.texture is not None:
+            raise UserError("a material with a texture needs `uv`")
+        if self.uv is not None:
+            uv = floats("uv", self.uv, None, 2)
+            corner = triangles if self.uv_triangles is None else self.uv_triangles
+            object.__setattr__(self, "uv", uv)
+            object.__setattr__(self, "uv_triangles", ints("uv_triangles", corner, len(triangles), 3, below=len(uv)))
+        if self.vertex_colour is not None:
+            object.__setattr__(self, "vertex_colour", floats("vertex_colour", self.vertex_colour, len(points), 3))
+        elif self.material.vertex_colour:
+            object.__setattr__(self, "vertex_colour", np.tile(self.material.colour, (len(points), 1)))
+        if self.occlusion is not None:
+            object.__setattr__(
+                self, "occlusion", floats("occlusion", np.broadcast_to(self.occlusion, len(points)), None)
+            )
+
+
+def _incidence(triangles: Ints, n: int) -> tuple[Ints, Ints]:
+    """Triangles around each vertex, as (start (n + 1,), list)."""
+    flat = triangles.ravel()
+    order = np.argsort(flat, kind="stable")
+    start = np.zeros(n + 1, dtype=np.int32)
+    np.cumsum(np.bincount(flat, minlength=n), out=start[1:])
+    return start, np.ascontiguousarray(order // 3, dtype=np.int32)
+
+
+def _joined(items: Sequence[DrawItem], first: Ints) -> raster.Mesh:
+    triangles = np.concatenate([item.triangles + f for item, f in zip(items, first[:-1], strict=True)])
+    uv = np.zeros((len(triangles), 6), dtype=np.float32)
+    at = 0
+    for item in items:
+        if item.uv is not None and item.uv_triangles is not None:
+            uv[at : at + len(item.triangles)] = item.uv[item.uv_triangles].reshape(-1, 6)
+        at += len(item.triangles)
+    start, incident = _incidence(triangles, int(first[-1]))
+    owner = np.repeat(np.arange(len(items), dtype=np.int32), [len(item.triangles) for item in items])
+    return raster.Mesh(np.ascontiguousarray(triangles, dtype=np.int32), owner, start, incident, uv)
+
+
+def _contact_steps() -> Floats:
+    """Offsets (units of the radius, y up) and weights of the contact shade: two rings, the upper half weighs most."""
+    rows = []
+    for radius, taps, turn in ((0.3, 6, 0.0), (0.65, 8, 0.2), (1.0, 10, 0.4)):
+        for i in range(taps):
+            angle = 2.0 * np.pi * (i + turn) / taps
+            x, y = radius * np.cos(angle), radius * np.sin(angle)
+            rows.append((x, y, (1.2 - 0.6 * radius) * (0.35 + 0.65 * max(np.sin(angle), 0.0))))
+    steps = np.array(rows)
+    steps[:, 2] /= steps[:, 2].sum()
+    return steps
+
+
+class Renderer:
+    """Draws the same items, moved, again and again, from one camera.
+
+    size : (width, height) [pixel] or one number   items : drawn together, those of a higher `Material.layer` blended
+    over the rest with `layer_opacity`. `draw` returns (height, width, 3) RGB bytes, valid until the next call.
+    """
+
+    def __init__(
+        self,
+        size: int | tuple[int, int],
+        camera: Camera,
+        items: Sequence[DrawItem],
+        *,
+        look: Look | None = None,
+        layer_opacity: float = 0.5,
+    ) -> None:
+        width, height = (size, size) if isinstance(size, int) else size
+        if not (8 <= width <= 16384 and 8 <= height <= 16384):
+            raise UserError(f"the picture is {width} x {height} pixels; each side must lie between 8 and 16384")
+        if not items:
+            raise UserError("there is nothing to draw: `items` is empty")
+        if not 0.0 <= layer_opacity <= 1.0:
+            raise UserError(f"layer_opacity is {layer_opacity}; it must lie between 0 and 1")
+        self.size, self.items, self.look = (width, height), tuple(items), look or Look()
+        self.layer_opacity = layer_opacity
+        self._layers = sorted({item.material.layer for item in items})
+        self._first = np.cumsum([0] + [len(item.points) for item in items]).astype(np.int32)
+        self._mesh = _joined(self.items, self._first)
+        self._frame = raster.buffers(int(self._first[-1]), len(self._mesh.triangle), width, height)
+        self._paint = paint_tables([item.material for item in items], self.look, height)
+        self._points = np.concatenate([item.points for item in items])
+        self._steps = _contact_steps()
+        bands = len(self._frame.row_start) - 1
+        self._stride = next(s for s in range(max(int(0.618 * bands), 1), bands + 2) if gcd(s, bands) == 1)
+        self._whole = np.zeros((bands, shade.N_WHOLE, 4 * width), np.int32)
+        self._number = np.zeros((bands, shade.N_NUMBER, 4 * width), np.float32)
+        casts = np.array([item.material.casts and item.material.layer == 0 for item in items])[self._mesh.item]
+        use = self.look.shadow and bool(casts.any())
+        self._shadow_map = ShadowMap(self._mesh, casts, self._points, self._paint) if use else None
+        self._shadow = no_shadow()
+        self._out = np.zeros((height, width, 3), np.uint8)
+        self.camera = camera
+        for i, item in enumerate(self.items):
+            self.set_occlusion(i, 1.0 if item.occlusion is None else item.occlusion)
+            if item.vertex_colour is not None:
+                self.set_colour(i, item.vertex_colour)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; may be replaced between frames."""
+        return self._camera
+
+    @camera.setter
+    def camera(self, camera: Camera) -> None:
+        self._camera = camera
+        self._numbers = camera.numbers(*self.size)
+
+    def _slice(self, item: int) -> slice:
+        return slice(int(self._first[item]), int(self._first[item + 1]))
+
+    def set_occlusion(self, item: int, value: Any) -> None:
+        """Set how open to light the vertices of an item are, (n,) or one number in [0, 1]."""
+        self._frame.vertex[self._slice(item), 3] = value
+
+    def set_colour(self, item: int, colour: Any) -> None:
+        """Set the colours of an item's vertices, (n, 3) sRGB in [0, 1]; its material must have `vertex_colour`."""
+        self._frame.vertex[self._slice(item), 4:7] = linear(colour)
+
+    def _place(self, points: Mapping[int, Any] | Sequence[Any] | None, bone_pose: Any) -> None:
+        given = points if isinstance(points, Mapping) else dict(enumerate(points or ()))
+        for i, item in enumerate(self.items):
+            target = self._points[self._slice(i)]
+            new = given.get(i)
+            if new is not None:
+                if np.shape(new) != target.shape:
+                    raise UserError(f"item {i} has {len(target)} vertices; points of shape {np.shape(new)} were given")
+                target[:] = new
+            elif item.bone is not None and bone_pose is not None:
+                pose = bone_pose[item.bone]
+                np.matmul(item.points, pose[:3, :3].T, out=target)
+                target += pose[:3, 3]
+
+    def _cover(self, layer: int) -> None:
+        """Fill the sample buffers with one layer."""
+        raster.setup_pass(self._mesh, self._numbers, float(layer), self._frame, self._paint)
+        if raster.band_pass(self._frame) > len(self._frame.row_list):
+            self._frame = raster.longer_list(self._frame)
+            raster.band_pass(self._frame)
+        raster.coverage_pass(self._stride, self._mesh, self._numbers, self._frame)
+
+    def _prepare(self) -> None:
+        """Normals and projection of all vertices."""
+        if not isfinite(float(self._points.sum())):
+            bad = int(np.argmax(~np.isfinite(self._points).all(axis=1)))
+            item = int(np.searchsorted(self._first, bad, side="right")) - 1
+            raise RunError(f"vertex {bad - self._first[item]} of item {item} has a position that is not finite")
+        raster.facet_pass(self._mesh, self._points, self._frame)
+        raster.vertex_pass(self._mesh, self._points, self._numbers, self._frame)
+
+    def depth(self) -> Floats:
+        """Return the depth [mm] of the four samples of each pixel as last placed, (h, w, 4), inf where nothing is."""
+        self._prepare()
+        self._cover(self._layers[0])
+        width, height = self.size
+        number = (self._frame.sample >> 32).reshape(height, -1, 4)[:, :width]
+        with np.errstate(divide="ignore"):
+            return raster.DEEPEST * self.camera.near / number
+
+    def draw(self, points: Mapping[int, Any] | Sequence[Any] | None = None, bone_pose: Any = None) -> Bytes:
+        """Draw one frame.
+
+        points : new positions (n, 3) [mm] by item (a mapping, or a sequence with None for items that stay)
+        bone_pose : (b, 4, 4), rest frame to head frame [mm], carries the items that have a `bone`
+        Returns (height, width, 3) RGB bytes, overwritten by the next call.
+        Raises `UserError` for points of a wrong shape, `RunError` for positions that are not finite.
+        """
+        self._place(points, bone_pose)
+        self._prepare()
+        if self._shadow_map is not None:
+            direction = self._paint.light[0, :3].astype(np.float64)
+            self._shadow = self._shadow_map.draw(self._points, self._camera, direction)
+        for layer in self._layers:
+            self._cover(layer)
+            opacity = -1.0 if layer == self._layers[0] else self.layer_opacity
+            tail = (self._frame, self._paint, self._shadow, self._steps, self._whole, self._number, self._out)
+            shade.shade_pass(self._stride, opacity, self._mesh, self._numbers, *tail)
+        return self._out
