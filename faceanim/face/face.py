@@ -206,7 +206,9 @@ class Face:
         margin = distance_along(self.mesh, openings)
         stiffness = attach.attachment_stiffness(self.mesh, self.region, self.depth, margin, h)
         stiffness = 0.5 * (stiffness + stiffness[self.mirror])
-        return Attachment(self.bone_weight, stiffness, h.alpha, h.s0)
+        lids = (self.region[self.mesh.triangles] == LID).any(axis=1)
+        shear = np.where(lids, h.shear * h.lid_shear, h.shear)
+        return Attachment(self.bone_weight, stiffness, h.alpha, h.s0, shear)
 
     def body(self) -> Body:
         """Return this head as a body that any backend can move."""
@@ -272,12 +274,12 @@ def _parts(arrays: dict[str, np.ndarray]) -> list[Part]:
 
 
 def _lid_edge(points: Floats, lid: Ints, centre: Floats, up: float) -> Ints:
-    """Return the lid's vertices nearest to the opening: for each of some columns in x, the lowest (upper lid)."""
+    """Return the lid's vertices nearest to the opening: for each of nine columns in x, the lowest (upper lid)."""
     x = points[lid, 0]
-    column = np.clip(((x - x.min()) / (np.ptp(x) + 1e-9) * 14).astype(int), 0, 13)
+    column = np.clip(((x - x.min()) / (np.ptp(x) + 1e-9) * 9).astype(int), 0, 8)
     front = points[lid, 2] > centre[2]
     edge = []
-    for k in range(14):
+    for k in range(9):
         inside = lid[(column == k) & front]
         if len(inside):
             edge.append(inside[np.argmin(up * points[inside, 1])])

@@ -159,8 +159,8 @@ def both_sides(table: dict[str, AnyMuscle]) -> dict[str, tuple[AnyMuscle, str]]:
 
 
 def _bump(r: Floats) -> Floats:
-    """The radial bump (1 - r^2)^2 on r < 1, 0 beyond: 1 with zero slope at 0, 0 with zero slope at 1."""
-    return np.where(r < 1.0, (1.0 - np.minimum(r, 1.0) ** 2) ** 2, 0.0)
+    """The radial bump (1 - r^2)^2 on |r| < 1, 0 beyond: 1 with zero slope at 0, 0 with zero slope at 1."""
+    return (1.0 - np.minimum(np.abs(r), 1.0) ** 2) ** 2
 
 
 def _on_side(terrain: Terrain, side: Side) -> Floats:

@@ -32,6 +32,7 @@ class Hypodermis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The tie from skin to bone.
 
     modulus [kPa], smallest_thickness [mm], alpha [-], s0 [mm] of its growth; factors lip, lid, mucosa [-];
+    shear [mN/mm] of the layer (shear modulus times effective depth), lid_shear [-] its factor on the lids;
     fade_length [mm] from the openings; clear_choice, blend_length [mm] of the share between cranium and jaw
     """
 
@@ -42,6 +43,8 @@ class Hypodermis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lip: float
     lid: float
     mucosa: float
+    shear: float
+    lid_shear: float
     fade_length: float
     clear_choice: float
     blend_length: float

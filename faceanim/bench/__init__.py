@@ -1,0 +1,1 @@
+"""Measuring: how far, how true, how fast; tables and charts of it."""

@@ -1,0 +1,97 @@
+"""Options that several commands share, and how their words become values; every complaint names option and limits."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import fields
+from typing import Any
+
+from faceanim.ground.errors import UserError, unknown_name
+
+
+def add_simulation(parser: argparse.ArgumentParser) -> None:
+    """Declare who is simulated and how."""
+    group = parser.add_argument_group("simulation")
+    group.add_argument("--face", default="default", help="name of the face (default: %(default)s)")
+    group.add_argument("--density", default="default", help="coarse, default or fine")
+    group.add_argument("--backend", default="mass_spring", help="how flesh answers (default: %(default)s)")
+    group.add_argument("--scheme", help="time stepping: block_descent, newton, explicit, semi_implicit or paper")
+    which = group.add_mutually_exclusive_group()
+    which.add_argument("--adaptive", dest="adaptive", action="store_true", default=None,
+                       help="dynamic, quasi-static and static vertices (default)")  # fmt: skip
+    which.add_argument("--full", dest="adaptive", action="store_false", help="every vertex dynamic")
+    group.add_argument("--tolerance", metavar="MM", help="what the adaptive partition may cost in accuracy [mm]")
+    group.add_argument("--threads", metavar="N", help="processor cores to use (default: one to simulate, all to draw)")
+    group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[], help="any other backend option")
+
+
+def number(text: str | float, option: str, low: float, high: float, *, above: bool = False) -> float:
+    """Return `text` as a number in [low, high] (in (low, high] with `above`); raise `UserError` naming `option`."""
+    limits = f"{'more than ' if above else ''}{low:g} to {high:g}"
+    try:
+        value = float(text)
+    except ValueError:
+        raise UserError(f"{option} {text!r} is not a number; give {limits}") from None
+    if math.isnan(value) or not low <= value <= high or (above and value == low):
+        raise UserError(f"{option} {text} is outside its limits; give {limits}")
+    return value
+
+
+def whole(text: str, option: str, low: int, high: int) -> int:
+    """Return `text` as a whole number in [low, high]; raise `UserError` naming `option`."""
+    value = number(text, option, low, high)
+    if value != int(value):
+        raise UserError(f"{option} {text} is not a whole number; give {low} to {high}")
+    return int(value)
+
+
+def use_threads(text: str | None) -> int:
+    """Set how many threads compiled loops may use, if asked for, and return the number in use."""
+    import numba
+
+    if text is not None:
+        most: Any = vars(numba.config)["NUMBA_NUM_THREADS"]
+        numba.set_num_threads(whole(text, "--threads", 1, int(most)))
+    return int(numba.get_num_threads())
+
+
+def solver_options(args: argparse.Namespace) -> Any:
+    """Return the backend's Options as the command line asks for; adaptive unless it says --full.
+
+    Raises `UserError` for an option or a value that this backend does not know.
+    """
+    from faceanim.backends import backend_class
+
+    cls = backend_class(args.backend).Options
+    known = {f.name: f for f in fields(cls)}
+    wanted: dict[str, Any] = {}
+    if args.scheme is not None:
+        wanted["scheme"] = args.scheme
+    if args.tolerance is not None:
+        wanted["tolerance"] = number(args.tolerance, "--tolerance", 0.0, 10.0, above=True)
+    if args.adaptive is not None or "adaptive" in known:
+        wanted["adaptive"] = args.adaptive is not False
+    for setting in args.option:
+        name, equals, text = (part.strip() for part in setting.partition("="))
+        if not (name and equals and text):
+            raise UserError(f"--option {setting!r} is not understood; write name=value")
+        wanted[name] = text
+    for name, value in wanted.items():
+        if name not in known:
+            raise unknown_name(f"option of backend {args.backend}", name, known)
+        if isinstance(value, str):
+            wanted[name] = _typed(value, getattr(cls(), name), name)
+    return cls(**wanted)
+
+
+def _typed(text: str, default: Any, name: str) -> Any:
+    if isinstance(default, bool):
+        if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
+            raise UserError(f"--option {name}={text}: true or false is needed")
+        return text.lower() in ("true", "yes", "1")
+    if isinstance(default, int):
+        return whole(text, f"--option {name}", -(10**9), 10**9)
+    if isinstance(default, float):
+        return number(text, f"--option {name}", -1e12, 1e12)
+    return text
