@@ -12,17 +12,23 @@ import numpy as np
 from faceanim.backends.solver import Energy, State, StepReport
 from faceanim.body.body import Attachment, Body, Bone, Muscles
 from faceanim.body.control import Control
+from faceanim.expression.action_units import load_action_units
 from faceanim.geometry.shapes import sphere
 from faceanim.geometry.surface import TriMesh
 from faceanim.tissue.spring_law import SpringLaw
 
-SIDES = ("left", "right")
-MUSCLES = (
-    *(f"{base}_{side}" for base in ("frontalis_inner", "zygomaticus_major", "buccinator") for side in SIDES),
-    *(f"orbicularis_oculi_{part}_{side}" for part in ("orbital", "palpebral") for side in SIDES),
-    "procerus",
-    "orbicularis_oris_pucker",
-)
+UNPAIRED = ("procerus", "orbicularis_oris")
+
+
+def _muscles() -> tuple[str, ...]:
+    """Return full names of every muscle that the action units use."""
+    bases = sorted({name for unit in load_action_units().values() for name in unit.muscles})
+    return tuple(
+        full for base in bases for full in ((base,) if base.startswith(UNPAIRED) else (f"{base}_left", f"{base}_right"))
+    )
+
+
+MUSCLES = _muscles()
 
 
 def patch(size: int = 9) -> TriMesh:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from statistics import median
 from time import perf_counter
@@ -68,6 +71,21 @@ def partition_ms(session: Session) -> float | None:
     """Return what the partition of a prepared session cost to compute [ms], None if it was not computed now."""
     seconds = getattr(getattr(session.solver, "partition", None), "seconds", 0.0)
     return 1e3 * seconds if seconds > 0.0 else None
+
+
+@contextmanager
+def fresh_partitions() -> Iterator[None]:
+    """Keep cached files in a new empty folder for a while, so that partitions are computed and their cost measured."""
+    name = "FACEANIM_CACHE"
+    before = os.environ.get(name)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[name] = folder
+        try:
+            yield
+        finally:
+            os.environ.pop(name)
+            if before is not None:
+                os.environ[name] = before
 
 
 def frame_rate(

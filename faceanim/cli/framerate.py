@@ -78,11 +78,15 @@ def _measure(sessions: list[Any], size: int, threads: int, progress: Progress, *
     """Simulate on one core and draw on `threads`; return one row per expression."""
     import numba
 
-    from faceanim.bench.framerate import frame_rate
+    from faceanim.bench.framerate import frame_rate, fresh_partitions
     from faceanim.cli.drawing import Drawing, Picture
 
     drawing = Drawing(sessions[0], Picture((size, size))) if size else None
     rows = []
+    progress.stage("compiling what is not compiled yet")
+    first = sessions[0]
+    first.solver.step(first.solver.rest(), first.solver.rest(), first.control(0.1), first.dt)
+    first.solver.solve_static(first.control(0.1))
     progress.stage("measuring", len(sessions))
     for session in sessions:
         progress.detail(session.expression.name)
@@ -93,7 +97,8 @@ def _measure(sessions: list[Any], size: int, threads: int, progress: Progress, *
             drawing.draw(points, session.timeline.at(t))
 
         numba.set_num_threads(1)
-        session.warm()
+        with fresh_partitions():
+            session.warm()
         rows.append(frame_rate(session, draw if drawing else None, accuracy=accuracy, drawing_threads=threads))
         progress.advance()
     numba.set_num_threads(threads)

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from faceanim.ground.jit import kernel
 from faceanim.kernels.linalg3 import add_identity, add_outer
+from faceanim.kernels.memory import load
 
 
 @kernel
@@ -47,41 +50,43 @@ def growth(q, alpha):
 
 
 @kernel(inline=True)
-def shear_force(i, px, py, pz, x, anchor, tethers):
-    """Return the force of the shear layer on vertex `i` at (px, py, pz) and the sum of its stiffnesses."""
-    px -= anchor[i, 0]
-    py -= anchor[i, 1]
-    pz -= anchor[i, 2]
-    fx = 0.0
-    fy = 0.0
-    fz = 0.0
-    k = 0.0
+def tie(shift, i, tethers):
+    """Return the force of tether and shear layer on vertex `i`, its bound of the stiffness and the tether's secant one.
+
+    shift : (n, 3) positions minus anchors
+    """
+    dx = load(shift, 3 * i)
+    dy = load(shift, 3 * i + 1)
+    dz = load(shift, 3 * i + 2)
+    q = (dx * dx + dy * dy + dz * dz) / (tethers.s0 * tethers.s0)
+    secant, tangent = growth(q, tethers.alpha)
+    secant *= tethers.stiffness[i]
+    total = tethers.shear_sum[i]
+    fx = -(secant + total) * dx
+    fy = -(secant + total) * dy
+    fz = -(secant + total) * dz
     for e in range(tethers.start[i], tethers.start[i + 1]):
-        j = tethers.neighbour[e]
-        w = tethers.shear[e]
-        fx += w * (x[j, 0] - anchor[j, 0] - px)
-        fy += w * (x[j, 1] - anchor[j, 1] - py)
-        fz += w * (x[j, 2] - anchor[j, 2] - pz)
-        k += w
-    return fx, fy, fz, k
+        j = 3 * np.intp(load(tethers.neighbour, e))
+        w = load(tethers.shear, e)
+        fx += w * load(shift, j)
+        fy += w * load(shift, j + 1)
+        fz += w * load(shift, j + 2)
+    return fx, fy, fz, tethers.stiffness[i] * tangent + total, secant + total
 
 
 @kernel
-def tether_force(x, anchor, tethers, m, force):
+def find_shift(x, anchor, shift):
+    """Write `x` minus `anchor` into `shift`, all (n, 3)."""
+    for i in range(len(x)):
+        for d in range(3):
+            shift[i, d] = x[i, d] - anchor[i, d]
+
+
+@kernel
+def tether_force(shift, tethers, m, force):
     """Add the force on the first `m` vertices and the tangent stiffness along the tether to `force` (n, 4)."""
-    per = 1.0 / (tethers.s0 * tethers.s0)
     for i in range(m):
-        k = tethers.stiffness[i]
-        if k > 0.0:
-            dx = x[i, 0] - anchor[i, 0]
-            dy = x[i, 1] - anchor[i, 1]
-            dz = x[i, 2] - anchor[i, 2]
-            secant, tangent = growth((dx * dx + dy * dy + dz * dz) * per, tethers.alpha)
-            force[i, 0] -= k * secant * dx
-            force[i, 1] -= k * secant * dy
-            force[i, 2] -= k * secant * dz
-            force[i, 3] += k * tangent
-        fx, fy, fz, k = shear_force(i, x[i, 0], x[i, 1], x[i, 2], x, anchor, tethers)
+        fx, fy, fz, k, _ = tie(shift, i, tethers)
         force[i, 0] += fx
         force[i, 1] += fy
         force[i, 2] += fz

@@ -342,11 +342,14 @@ def find_pairs(x, colliders, reach, count, planes):
 
 
 @kernel
-def find(x, colliders, grids, pose, reach, planes):
-    """Write every contact nearer than `reach` [mm] (beyond its clearance) at positions `x` (n, 3) into `planes`."""
+def find(x, colliders, grids, pose, reach, pair_reach, planes):
+    """Write every contact nearer than `reach` [mm] beyond its clearance at positions `x` (n, 3) into `planes`.
+
+    pair_reach : the same for lips and lids, whose search is the dearest
+    """
     count = find_bones(x, colliders, grids, pose, reach, 0, planes)
     count = find_spheres(x, colliders, reach, count, planes)
-    planes.count[0] = find_pairs(x, colliders, reach, count, planes)
+    planes.count[0] = find_pairs(x, colliders, pair_reach, count, planes)
 
 
 @kernel

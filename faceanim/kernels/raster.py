@@ -7,7 +7,7 @@
 
 Bands of rows are independent and visit their triangles in index order: the picture does not depend on the number of
 threads. Camera space has x to the right, y up and z away from the eye; a pixel's ray is (rx, ry, 1), and the sums
-w_i = E_i . ray of a triangle are its barycentric coordinates divided by depth, whether or not it crosses the near plane.
+w_i = E_i . ray of a triangle are its barycentric coordinates divided by depth, even if it crosses the near plane.
 """
 
 from __future__ import annotations
@@ -53,11 +53,14 @@ class Frame(NamedTuple):
     """Buffers of one picture.
 
     facet : (t, 3) area-weighted normals [mm^2]   eye : (n, 3) camera space [mm]   screen : (n, 2) [1/256 pixel]
-    vertex : (n, 8) normal, occlusion, linear colour, depth   plane : (t, 9) rows E_i   deep : (t, 5) 1/depth gradient
-    in x and y, value at pixel (0, 0), least, largest, as depth numbers   look : (t, 5) mip level, unit normal, side
-    box : (t, 4) first and last pixel in x and y; empty if culled   sample : (h, ceil(w / 4), 16) four a pixel, 0 = none:
-    depth number << 32 | LAST_NAME - triangle, so that the larger of two is the nearer, of equals the first triangle
+    vertex : (n, 8) normal, occlusion, linear colour, depth   plane : (t, 16) rows E_i and the P_ columns
+    deep : (t, 8) depth number: gradient in x and y, value at pixel (0, 0), least, largest; side (1 front, -1 back)
+    box : (t, 4) first and last pixel in x and y; empty if culled
+    sample : (h, ceil(w / 4), 16) four a pixel, 0 = none: depth number << 32 | LAST_NAME - triangle, so that the larger
+    of two is the nearer, and of equals the first triangle
     row_start : (bands + 1,)   row_list : triangles by band
+    fragment : (h, N_WHOLE, 4 w) pixel, triangle and number of samples of each surface seen in each row, from left to
+    right, `count` (h,) of them
     A depth number is DEEPEST * near / depth, a whole number up to DEEPEST.
     """
 
@@ -67,11 +70,20 @@ class Frame(NamedTuple):
     vertex: np.ndarray
     plane: np.ndarray
     deep: np.ndarray
-    look: np.ndarray
     box: np.ndarray
     sample: np.ndarray
     row_start: np.ndarray
     row_list: np.ndarray
+    fragment: np.ndarray
+    count: np.ndarray
+
+
+def _aligned(rows: int, columns: int, kind: type) -> np.ndarray:
+    """Return zeros (rows, columns) that start at a cache line, so that rows of 32 or 64 bytes do not straddle two."""
+    size = np.dtype(kind).itemsize
+    raw: np.ndarray = np.zeros(rows * columns + 64 // size, kind)
+    skip = (-raw.ctypes.data % 64) // size
+    return raw[skip : skip + rows * columns].reshape(rows, columns)
 
 
 def buffers(n: int, t: int, width: int, height: int) -> Frame:
@@ -81,14 +93,15 @@ def buffers(n: int, t: int, width: int, height: int) -> Frame:
         facet=np.zeros((t, 3), np.float32),
         eye=np.zeros((n, 3)),
         screen=np.zeros((n, 2), np.int32),
-        vertex=np.zeros((n, 8), np.float32),
-        plane=np.zeros((t, 9), np.float32),
-        deep=np.zeros((t, 5)),
-        look=np.zeros((t, 5), np.float32),
+        vertex=_aligned(n, 8, np.float32),
+        plane=_aligned(t, 16, np.float32),
+        deep=_aligned(t, 8, np.float64),
         box=np.zeros((t, 4), np.int32),
         sample=np.zeros((height, (width + 3) // 4, 16), np.int64),
         row_start=np.zeros(bands + 1, np.int32),
         row_list=np.zeros(4 * t + 64, np.int32),
+        fragment=np.zeros((height, N_WHOLE, 4 * width), np.int32),
+        count=np.zeros(height, np.int32),
     )
 
 
@@ -139,6 +152,14 @@ LIGHTS = 3
 ENCODE = 8192
 ENCODE_TOP = 2.0
 """The encoding table spans linear values [0, ENCODE_TOP)."""
+
+P_MIP, P_NORMAL, P_SIDE = 9, 10, 13
+W_PIXEL, W_TRIANGLE, W_SAMPLES, N_WHOLE = 0, 1, 2, 3
+
+SAME_DEPTH = 0.006
+"""Samples of one item in one pixel share a colour if their depths differ by less than this part ..."""
+SAME_TURN = 0.8
+"""... and the cosine between their triangles is above this."""
 
 # Camera numbers, one array: 9 rows of the rotation, 3 position, focal length [pixel], centre x, centre y, near [mm].
 C_POSITION, C_FOCAL, C_X, C_Y, C_NEAR = 9, 12, 13, 14, 15
@@ -276,9 +297,7 @@ def _holds_sample(left, right, top, bottom):
 
 
 @kernel
-def _set_up(
-    first, last, layer, camera, triangle, item, uv, eye, screen, facet, plane, deep, look, box, material, level
-):
+def _set_up(first, last, layer, camera, triangle, item, uv, eye, screen, facet, plane, deep, box, material, level):
     """`setup_pass` for triangles first..last-1."""
     width, height = int(2.0 * camera[C_X]), int(2.0 * camera[C_Y])
     for t in range(first, last):
@@ -318,11 +337,11 @@ def _set_up(
             continue
         nx, ny, nz = facet[t, 0], facet[t, 1], facet[t, 2]
         scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-60))
-        look[t, 1], look[t, 2], look[t, 3] = scale * nx, scale * ny, scale * nz
-        look[t, 4] = 1.0 if area < 0 else -1.0
+        plane[t, P_NORMAL], plane[t, P_NORMAL + 1], plane[t, P_NORMAL + 2] = scale * nx, scale * ny, scale * nz
+        plane[t, P_SIDE] = deep[t, 5] = 1.0 if area < 0 else -1.0
         if material[m, M_SOURCE] == 1.0:
             k = int(material[m, M_TEXTURE])
-            look[t, 0] = _mip(uv, t, level[k, 0, 1], level[k, 0, 2], 0.5 * abs(area) / (SUB * SUB))
+            plane[t, P_MIP] = _mip(uv, t, level[k, 0, 1], level[k, 0, 2], 0.5 * abs(area) / (SUB * SUB))
         box[t, 0], box[t, 1], box[t, 2], box[t, 3] = lo_x, hi_x, lo_y, hi_y
 
 
@@ -330,14 +349,7 @@ def _set_up(
 def setup_pass(mesh, camera, layer, frame, paint):
     """Cull the triangles of one layer; fill plane equations, mip levels and pixel boxes of those that may be seen."""
     triangle, item, uv, eye, screen, facet = mesh.triangle, mesh.item, mesh.uv, frame.eye, frame.screen, frame.facet
-    plane, deep, look, box, material, level = (
-        frame.plane,
-        frame.deep,
-        frame.look,
-        frame.box,
-        paint.material,
-        paint.level,
-    )
+    plane, deep, box, material, level = frame.plane, frame.deep, frame.box, paint.material, paint.level
     chunks = (triangle.shape[0] + CHUNK - 1) // CHUNK
     for k in prange(chunks):
         last = min((k + 1) * CHUNK, triangle.shape[0])
@@ -354,7 +366,6 @@ def setup_pass(mesh, camera, layer, frame, paint):
             facet,
             plane,
             deep,
-            look,
             box,
             material,
             level,
@@ -460,8 +471,50 @@ def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, mos
         z += gy
 
 
+@kernel(inline=True)
+def _triangle(sample):
+    return LAST_NAME - (sample & LAST_NAME)
+
+
 @kernel
-def _cover_band(band, triangle, eye, screen, look, box, deep, row_start, row_list, camera, sample):
+def _list_row(width, sample, item, plane, whole):
+    """List the fragments of one row of samples (w / 4, 16), from left to right; return how many there are."""
+    n = 0
+    for x in range(width):
+        u, q = x >> 2, 4 * (x & 3)
+        s0, s1, s2, s3 = sample[u, q], sample[u, q + 1], sample[u, q + 2], sample[u, q + 3]
+        if (((s0 ^ s1) | (s0 ^ s2) | (s0 ^ s3)) & LAST_NAME) == 0:
+            if s0 > 0:
+                whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(s0), 4
+                n += 1
+            continue
+        done = 0
+        for i in range(4):
+            si = sample[u, q + i]
+            if si == 0 or (done >> i) & 1:
+                continue
+            t, count = _triangle(si), 1
+            for j in range(i + 1, 4):
+                sj = sample[u, q + j]
+                if sj == 0 or (done >> j) & 1:
+                    continue
+                k = _triangle(sj)
+                if t != k:
+                    if item[t] != item[k] or abs((si >> 32) - (sj >> 32)) > SAME_DEPTH * (si >> 32):
+                        continue
+                    turn = plane[t, P_NORMAL] * plane[k, P_NORMAL]
+                    turn += plane[t, P_NORMAL + 1] * plane[k, P_NORMAL + 1]
+                    if turn + plane[t, P_NORMAL + 2] * plane[k, P_NORMAL + 2] < SAME_TURN:
+                        continue
+                count += 1
+                done |= 1 << j
+            whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, t, count
+            n += 1
+    return n
+
+
+@kernel
+def _cover_band(band, triangle, eye, screen, box, deep, row_start, row_list, camera, sample):
     """Clear one band of rows and draw its triangles into it."""
     first = band * BAND
     last = min(first + BAND, sample.shape[0]) - 1
@@ -475,7 +528,7 @@ def _cover_band(band, triangle, eye, screen, look, box, deep, row_start, row_lis
         x3, y3 = x2, y2
         if min(x0, x1, x2) == BEHIND:
             x0, y0, x1, y1, x2, y2, x3, y3 = _clip(camera, eye, screen, a, b, c)
-        if look[t, 4] < 0.0:
+        if deep[t, 5] < 0.0:
             x1, y1, x3, y3 = x3, y3, x1, y1
         lo_x, hi_x = np.int64(box[t, 0]), np.int64(box[t, 1])
         lo_y, hi_y = max(np.int64(box[t, 2]), first), min(np.int64(box[t, 3]), last)
@@ -491,12 +544,25 @@ def _cover_band(band, triangle, eye, screen, look, box, deep, row_start, row_lis
             _cover(x0, y0, x2, y2, x3, y3, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, sample)
 
 
+@kernel
+def _list_band(band, width, item, plane, sample, fragment, count):
+    """List the fragments of one band of rows."""
+    for y in range(band * BAND, min((band + 1) * BAND, sample.shape[0])):
+        count[y] = _list_row(width, sample[y], item, plane, fragment[y])
+
+
 @kernel(parallel=True)
-def coverage_pass(stride, mesh, camera, frame):
-    """Fill `sample`; `stride`, coprime to the number of bands, deals the bands out evenly to threads."""
-    triangle, eye, screen, look, box, deep = mesh.triangle, frame.eye, frame.screen, frame.look, frame.box, frame.deep
+def coverage_pass(stride, listed, mesh, camera, frame):
+    """Fill `sample` and, if `listed`, the list of fragments.
+
+    `stride`, coprime to the number of bands, deals the bands out evenly to threads.
+    """
+    triangle, eye, screen, box, deep = mesh.triangle, frame.eye, frame.screen, frame.box, frame.deep
     row_start, row_list, sample = frame.row_start, frame.row_list, frame.sample
+    item, plane, fragment, count, width = mesh.item, frame.plane, frame.fragment, frame.count, int(2.0 * camera[C_X])
     bands = row_start.shape[0] - 1
     for k in prange(bands):
         b = (k * stride) % bands
-        _cover_band(b, triangle, eye, screen, look, box, deep, row_start, row_list, camera, sample)
+        _cover_band(b, triangle, eye, screen, box, deep, row_start, row_list, camera, sample)
+        if listed:
+            _list_band(b, width, item, plane, sample, fragment, count)

@@ -4,8 +4,8 @@ Light is linear: three directional lights with wrapped diffuse reflection (each 
 widest, as light that entered skin comes out redder), a microfacet highlight, and a sky and ground ambient term darkened
 by occlusion. Occlusion is stored per vertex; eyes, teeth and tongue add a contact shade taken from the depth samples.
 
-A row of pixels is worked off in stages over a small table: list the fragments (pixel, triangle, samples), interpolate
-and look up their attributes, light them (vector instructions), add them up.
+A row of pixels is worked off in stages over a small table of its fragments: interpolate their attributes, look up the
+texture and the shadow, light them (vector instructions), add them up. `whole` is the row of `Frame.fragment`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from faceanim.kernels.raster import (
     DEEPEST,
     ENCODE,
     ENCODE_TOP,
-    LAST_NAME,
     M_BACK,
     M_BLUE,
     M_FLAT,
@@ -39,16 +38,15 @@ from faceanim.kernels.raster import (
     M_TEXTURE,
     M_WIRE,
     M_WRAP,
+    P_MIP,
+    P_SIDE,
+    W_PIXEL,
+    W_SAMPLES,
+    W_TRIANGLE,
 )
 from faceanim.kernels.shadow import shadow_run
 
-SAME_DEPTH = 0.006
-"""Samples of one item in one pixel share a colour if their depths differ by less than this part ..."""
-SAME_TURN = 0.8
-"""... and the cosine between their triangles is above this."""
-
-# Fragment table: rows of whole numbers and of numbers.
-W_PIXEL, W_TRIANGLE, W_SAMPLES, N_WHOLE = 0, 1, 2, 3
+# Rows of the table of attributes.
 A_NX, A_NY, A_NZ, A_OPEN, A_RED, A_GREEN, A_BLUE, A_MIP, A_DEPTH, A_LIT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
 A_TEXTURE, A_OUT, N_NUMBER = 10, 13, 16
 
@@ -61,60 +59,11 @@ _SHADED, _BOUNCE, _RIM = np.float32(0.22), np.float32(0.8), np.float32(0.35)
 store0, store1, store2 = STORE[0], STORE[1], STORE[2]
 
 
-# --------------------------------------------------------------------------------------------------- 1. fragments
-
-
-@kernel(inline=True)
-def _triangle(sample):
-    return LAST_NAME - (sample & LAST_NAME)
+# -------------------------------------------------------------------------------------------------- 1. attributes
 
 
 @kernel
-def _list_row(width, sample, item, look, whole):
-    """List the fragments of one row of samples (w / 4, 16), from left to right; return how many there are."""
-    n, any_ = 0, np.int64(0)
-    for x in range(width):
-        u, q = x >> 2, 4 * (x & 3)
-        if q == 0:
-            any_ = sample[u, 0]
-            for i in range(1, 16):
-                any_ |= sample[u, i]
-        if any_ == 0:
-            continue
-        s0, s1, s2, s3 = sample[u, q], sample[u, q + 1], sample[u, q + 2], sample[u, q + 3]
-        if (((s0 ^ s1) | (s0 ^ s2) | (s0 ^ s3)) & LAST_NAME) == 0:
-            if s0 > 0:
-                whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(s0), 4
-                n += 1
-            continue
-        done = 0
-        for i in range(4):
-            si = sample[u, q + i]
-            if si == 0 or (done >> i) & 1:
-                continue
-            t, count = _triangle(si), 1
-            for j in range(i + 1, 4):
-                sj = sample[u, q + j]
-                if sj == 0 or (done >> j) & 1:
-                    continue
-                k = _triangle(sj)
-                if t != k:
-                    if item[t] != item[k] or abs((si >> 32) - (sj >> 32)) > SAME_DEPTH * (si >> 32):
-                        continue
-                    if look[t, 1] * look[k, 1] + look[t, 2] * look[k, 2] + look[t, 3] * look[k, 3] < SAME_TURN:
-                        continue
-                count += 1
-                done |= 1 << j
-            whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, t, count
-            n += 1
-    return n
-
-
-# -------------------------------------------------------------------------------------------------- 2. attributes
-
-
-@kernel
-def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, look, row, whole, number):
+def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, row, whole, number):
     """Interpolate normal, occlusion and colour (or texture position) of the n fragments of a row, all in float32."""
     for i in range(n):
         t = whole[W_TRIANGLE, i]
@@ -127,7 +76,7 @@ def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, look
         total = _1 / max(w0 + w1 + w2, _LEAST)
         w0, w1, w2 = w0 * total, w1 * total, w2 * total
         a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
-        side = look[t, 4]
+        side = plane[t, P_SIDE]
         number[A_NX, i] = side * (w0 * vertex[a, 0] + w1 * vertex[b, 0] + w2 * vertex[c, 0])
         number[A_NY, i] = side * (w0 * vertex[a, 1] + w1 * vertex[b, 1] + w2 * vertex[c, 1])
         number[A_NZ, i] = side * (w0 * vertex[a, 2] + w1 * vertex[b, 2] + w2 * vertex[c, 2])
@@ -139,7 +88,7 @@ def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, look
         if source == _1:
             number[A_RED, i] = w0 * uv[t, 0] + w1 * uv[t, 2] + w2 * uv[t, 4]
             number[A_GREEN, i] = w0 * uv[t, 1] + w1 * uv[t, 3] + w2 * uv[t, 5]
-            number[A_MIP, i] = look[t, 0]
+            number[A_MIP, i] = plane[t, P_MIP]
         elif source == _2:
             number[A_RED, i] = w0 * vertex[a, 4] + w1 * vertex[b, 4] + w2 * vertex[c, 4]
             number[A_GREEN, i] = w0 * vertex[a, 5] + w1 * vertex[b, 5] + w2 * vertex[c, 5]
@@ -172,7 +121,7 @@ def _contact_run(first, last, y, width, camera, row, step, sample, whole, number
         number[A_OPEN, i] *= max(1.0 - row[M_SHADE] * shade, 0.0)
 
 
-# ----------------------------------------------------------------------------------------------------- 3. texture
+# ----------------------------------------------------------------------------------------------------- 2. texture
 
 
 @kernel(inline=True)
@@ -224,7 +173,7 @@ def _texture_run(first, last, texel, level, table, top, number):
         store2(number, (A_TEXTURE + 2) * cap + i, (b0 + part * (b1 - b0)) * _DECODE)
 
 
-# ------------------------------------------------------------------------------------------------------- 4. light
+# ------------------------------------------------------------------------------------------------------- 3. light
 
 
 @kernel(inline=True)
@@ -322,7 +271,7 @@ def _light_run(first, last, colour, ry, centre, focal, light, ambient, row, whol
 
 @kernel
 def _wire_run(first, last, width, ry, camera, plane, whole, number):
-    """Darken fragments near the edges of their triangle: lines `width` [pixel] wide, soft by half a pixel either side."""
+    """Darken fragments near the edges of their triangle: lines `width` [pixel] wide, soft by half a pixel."""
     for i in range(first, last):
         t = whole[W_TRIANGLE, i]
         rx = (whole[W_PIXEL, i] + 0.5 - camera[C_X]) / camera[C_FOCAL]
@@ -336,7 +285,7 @@ def _wire_run(first, last, width, ry, camera, plane, whole, number):
             number[c, i] *= keep
 
 
-# ------------------------------------------------------------------------------------------------------ 5. adding
+# ------------------------------------------------------------------------------------------------------ 4. adding
 
 
 @kernel(inline=True)
@@ -377,18 +326,16 @@ def _blend_row(n, opacity, table, whole, number, row):
 
 
 @kernel
-def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, whole, number, out):
+def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number, out):
     """Colour one band of rows; over the background, or over `out` if opacity is not negative."""
-    triangle, item, plane, look, material = mesh.triangle, mesh.item, frame.plane, frame.look, paint.material
+    triangle, item, plane, material = mesh.triangle, mesh.item, frame.plane, paint.material
     sample, row32, table, width = frame.sample, paint.material32, paint.encode, out.shape[1]
     centre, focal = np.float32(camera[C_X]), np.float32(camera[C_FOCAL])
     for y in range(band * BAND, min((band + 1) * BAND, out.shape[0])):
         ry = (camera[C_Y] - y - 0.5) / camera[C_FOCAL]
         height = np.float32(ry)
-        n = _list_row(width, sample[y], item, look, whole)
-        _attribute_row(
-            n, height, centre, focal, triangle, item, mesh.uv, frame.vertex, plane, look, row32, whole, number
-        )
+        n, whole = frame.count[y], frame.fragment[y]
+        _attribute_row(n, height, centre, focal, triangle, item, mesh.uv, frame.vertex, plane, row32, whole, number)
         first = 0
         while first < n:
             m, last = item[whole[W_TRIANGLE, first]], first + 1
@@ -417,13 +364,14 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, whole, 
 
 
 @kernel(parallel=True)
-def shade_pass(stride, opacity, mesh, camera, frame, paint, shadow, step, whole, number, out):
+def shade_pass(stride, opacity, mesh, camera, frame, paint, shadow, step, number, out):
     """Write the picture `out` (h, w, 3) sRGB bytes; bands are dealt out as in `coverage_pass`.
 
     opacity : in [0, 1] blends over what `out` holds, negative draws over the background
-    shadow : of the key light, bias 0 = none   step : (taps, 3) of the contact shade   whole : (bands, N_WHOLE, 4 w), number : (bands, N_NUMBER, 4 w) work space
+    shadow : of the key light, bias 0 = none   step : (taps, 3) of the contact shade
+    number : (bands, N_NUMBER, 4 w) work space
     """
     bands = frame.row_start.shape[0] - 1
     for k in prange(bands):
         b = (k * stride) % bands
-        _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, whole[b], number[b], out)
+        _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, number[b], out)

@@ -106,10 +106,6 @@ def moment_pass(camera, middle, far, reach, sample, moment, spare):
         _blur_across(first, last, reach, moment, spare)
     for k in prange(bands):
         _blur_down(k * ROWS, min((k + 1) * ROWS, size), reach, spare, moment)
-    for k in prange(bands):
-        _blur_across(k * ROWS, min((k + 1) * ROWS, size), reach, moment, spare)
-    for k in prange(bands):
-        _blur_down(k * ROWS, min((k + 1) * ROWS, size), reach, spare, moment)
 
 
 @kernel
@@ -117,7 +113,8 @@ def shadow_run(first, last, ry, centre, focal, to_light, bias, places, whole, nu
     """Part of the key light that reaches fragments first..last-1, into a row of `number`.
 
     to_light : (16,) from camera space to the light's: 9 rotation, 3 shift [mm], focal length and centre of the map
-    [pixel], depth `middle` of the moments   bias : [mm]   places : the rows of pixel (in `whole`), depth and result (in `number`)
+    [pixel], depth `middle` of the moments   bias : [mm]
+    places : the rows of pixel (in `whole`), depth and result (in `number`)
     """
     cap, size = number.shape[1], moment.shape[1]
     pixel_at, depth_at, lit_at = places

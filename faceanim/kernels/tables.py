@@ -57,6 +57,7 @@ class Tethers(NamedTuple):
     rest : (n, 3) [mm]   bone_weight : (n, n_bone) [-], rows sum to 1   stiffness : (n,) [mN/mm]
     alpha [-], s0 [mm] : growth of the stiffness, as in `Law`
     The shear layer ties the displacements of neighbours: rows start[i]..start[i + 1] of `neighbour` and `shear` [mN/mm]
+    shear_sum : (n,) sum of each vertex's shear [mN/mm]
     """
 
     rest: F8
@@ -67,6 +68,7 @@ class Tethers(NamedTuple):
     start: I4
     neighbour: I4
     shear: F8
+    shear_sum: F8
 
 
 class Fibres(NamedTuple):
@@ -164,7 +166,7 @@ class Scene(NamedTuple):
 class Moment(NamedTuple):
     """What the control sets for one moment, written by the drivers.
 
-    anchor : (n, 3) [mm]   pose : (n_bone, 4, 4)   planes : `Planes`
+    anchor : (n, 3) [mm]   pose : (n_bone, 4, 4)   planes : `Planes`   shift : (n, 3) work, positions minus anchors
     The fibres of the muscles that act, packed: rows first[i]..first[i + 1] pull vertex i.
     first : (n + 1,)   target : (e, 3) [mm] or unit vector   pull : (e,) [mN]
     softening : (e,) [mm], negative where the target is a direction
@@ -177,6 +179,7 @@ class Moment(NamedTuple):
     pull: F8
     softening: F8
     planes: Planes
+    shift: F8
 
 
 class Drive(NamedTuple):

@@ -66,7 +66,7 @@ def draw_colour_bar(picture: Bytes, scale: Scale) -> None:
     picture[top:bottom, left : left + bar_w] = np.round(255.0 * scale.colours(values))[:, None]
     cv2.rectangle(picture, (left - 1, top - 1), (left + bar_w, bottom), INK, 1)
     for mark in marks:
-        y = int(round(bottom - 1 - (mark - scale.low) / (scale.high - scale.low or 1.0) * (bottom - top - 1)))
+        y = round(bottom - 1 - (mark - scale.low) / (scale.high - scale.low or 1.0) * (bottom - top - 1))
         cv2.line(picture, (left + bar_w, y), (left + bar_w + 3, y), INK, 1)
         write_text(picture, _number(mark, step), left + bar_w + 6, y + int(10 * font), scale=font)
     text_w, text_h = text_size(scale.label, font)
@@ -77,11 +77,11 @@ def draw_legend(picture: Bytes, entries: Sequence[tuple[str, tuple[float, float,
     """Draw a swatch and a name for each (name, sRGB colour) in the lower left corner of `picture` (h, w, 3)."""
     height = picture.shape[0]
     font = text_scale(height)
-    line = int(round(46 * font))
+    line = round(46 * font)
     y = height - line * len(entries) - line // 3
     for name, colour in entries:
         size = int(0.6 * line)
-        ink = tuple(int(round(255 * c)) for c in colour)
+        ink = tuple(round(255 * c) for c in colour)
         cv2.rectangle(picture, (8, y), (8 + size, y + size), ink, -1)
         cv2.rectangle(picture, (8, y), (8 + size, y + size), INK, 1)
         write_text(picture, name, 8 + size + 7, y + size - 1, scale=font)

@@ -110,8 +110,8 @@ class Renderer:
         layer_opacity: float = 0.5,
     ) -> None:
         width, height = (size, size) if isinstance(size, int) else size
-        if not (8 <= width <= 16384 and 8 <= height <= 16384):
-            raise UserError(f"the picture is {width} x {height} pixels; each side must lie between 8 and 16384")
+        if not (8 <= width <= 8192 and 8 <= height <= 8192):
+            raise UserError(f"the picture is {width} x {height} pixels; each side must lie between 8 and 8192")
         if not items:
             raise UserError("there is nothing to draw: `items` is empty")
         if not 0.0 <= layer_opacity <= 1.0:
@@ -127,7 +127,6 @@ class Renderer:
         self._steps = _contact_steps()
         bands = len(self._frame.row_start) - 1
         self._stride = next(s for s in range(max(int(0.618 * bands), 1), bands + 2) if gcd(s, bands) == 1)
-        self._whole = np.zeros((bands, shade.N_WHOLE, 4 * width), np.int32)
         self._number = np.zeros((bands, shade.N_NUMBER, 4 * width), np.float32)
         casts = np.array([item.material.casts and item.material.layer == 0 for item in items])[self._mesh.item]
         use = self.look.shadow and bool(casts.any())
@@ -181,7 +180,7 @@ class Renderer:
         if raster.band_pass(self._frame) > len(self._frame.row_list):
             self._frame = raster.longer_list(self._frame)
             raster.band_pass(self._frame)
-        raster.coverage_pass(self._stride, self._mesh, self._numbers, self._frame)
+        raster.coverage_pass(self._stride, True, self._mesh, self._numbers, self._frame)
 
     def _prepare(self) -> None:
         """Normals and projection of all vertices."""
@@ -217,6 +216,6 @@ class Renderer:
         for layer in self._layers:
             self._cover(layer)
             opacity = -1.0 if layer == self._layers[0] else self.layer_opacity
-            tail = (self._frame, self._paint, self._shadow, self._steps, self._whole, self._number, self._out)
+            tail = (self._frame, self._paint, self._shadow, self._steps, self._number, self._out)
             shade.shade_pass(self._stride, opacity, self._mesh, self._numbers, *tail)
         return self._out

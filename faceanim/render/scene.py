@@ -152,7 +152,7 @@ def head_scene(
 
     points, triangles : skin at rest, (n, 3) [mm] and (t, 3)   uv, uv_triangles, texture : skin texture, v up
     view : a name of `camera.VIEWS`, or a camera   bounds : (k, 3) points to keep in the picture, default the skin
-    parts : eyes, teeth, gums, tongue   bones : skull and jaw, shown through the skin with `bone_opacity` (0 = not at all)
+    parts : eyes, teeth, gums, tongue   bones : skull and jaw, seen through the skin with `bone_opacity` (0 = off)
     mode, scale : see `HeadScene`   wire : width of triangle edges drawn on the skin [pixel]
     occlusion : (n,) how open to light each skin vertex is; computed from the rest shape if None
     Raises `UserError` for unknown names and arrays that do not fit.

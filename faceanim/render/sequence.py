@@ -142,7 +142,7 @@ def have_h264() -> bool:
 
 
 class Film(_Context):
-    """Writes an MP4 film: H.264 if the optional package `av` is there (and `codec` does not say otherwise), else MPEG-4.
+    """Writes an MP4 film: H.264 if the optional package `av` is there (unless `codec` says otherwise), else MPEG-4.
 
     path : ends in .mp4   rate : frames per second   codec : "auto", "h264" or "mpeg4"
     H.264 needs even sides: an odd last row or column is dropped. The file gets its name when the film is closed.
@@ -173,19 +173,26 @@ class Film(_Context):
         size = (image.shape[1], image.shape[0])
         if self._size is None:
             self._size = size
-            self._coder = (_H264 if self.codec == "h264" else _Mpeg4)(self._part, size, self.rate)
+            self._guarded(self._start, size)
         if size != self._size:
             raise UserError(f"frame {self.count} is {size[0]} x {size[1]} pixels; the film is {self._size}")
         assert self._coder is not None
         self._guarded(self._coder.write, image)
         self.count += 1
 
+    def _start(self, size: tuple[int, int]) -> None:
+        self._coder = (_H264 if self.codec == "h264" else _Mpeg4)(self._part, size, self.rate)
+
     def _guarded(self, action: Any, *arguments: Any) -> None:
+        """Run one step of the encoder; its libraries raise exceptions of many kinds when the disk is full."""
         try:
             action(*arguments)
-        except OSError as error:
+        except Exception as error:
             self.abandon()
-            raise _failed(self.path, error) from error
+            reason = getattr(error, "strerror", None) or str(error)
+            raise RunError(
+                f"film {self.path} could not be written: {reason}; free some space or choose another folder"
+            ) from error
 
     def close(self) -> None:
         """Finish the film and give the file its name."""
@@ -241,8 +248,9 @@ class _H264:
     """H.264 through PyAV."""
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
-        import av
         from fractions import Fraction
+
+        import av
 
         self._av = av
         self._container = av.open(str(path), mode="w")

@@ -43,11 +43,15 @@ class Texture:
         base = np.ascontiguousarray(picture)
         if base.ndim != 3 or base.shape[2] != 3 or base.dtype != np.uint8 or min(base.shape[:2]) < 1:
             raise UserError(f"a texture must be (h, w, 3) bytes; this one is {base.shape} of {base.dtype}")
-        levels, light = [base], linear(base / 255.0).astype(np.float32)
+        fine = 1 << 14
+        decode = linear(np.arange(256) / 255.0).astype(np.float32)
+        encode = np.round(255.0 * srgb(np.arange(fine + 1) / fine)).astype(np.uint8)
+        levels, light = [base], decode[base]
         while min(light.shape[:2]) > 1:
             h, w = light.shape[0] // 2, light.shape[1] // 2
-            light = light[: 2 * h, : 2 * w].reshape(h, 2, w, 2, 3).mean(axis=(1, 3))
-            levels.append(np.round(255.0 * srgb(light)).astype(np.uint8))
+            rows = light[0 : 2 * h : 2] + light[1 : 2 * h : 2]
+            light = np.float32(0.25) * (rows[:, 0 : 2 * w : 2] + rows[:, 1 : 2 * w : 2])
+            levels.append(encode[(light * np.float32(fine) + np.float32(0.5)).astype(np.int32)])
         return cls(tuple(levels))
 
     @classmethod
@@ -71,7 +75,8 @@ class Material:
     glow : part of the ambient light that reaches places closed to the sky, red, green, blue
     shade_radius : [mm] of the contact shade that nearer surfaces throw (0 = none), `shade` its strength in [0, 1]
     wire : width of triangle edges drawn on top [pixel]   flat : 0 lit, 1 plain colour without any light
-    casts : throws a shadow of the key light   layer : 0 opaque; a higher layer has its own depth and is blended over the lower ones
+    casts : throws a shadow of the key light
+    layer : 0 opaque; a higher layer has its own depth and is blended over the lower ones
     """
 
     colour: Colour = (0.8, 0.8, 0.8)
@@ -123,7 +128,8 @@ class Light:
 class Lighting:
     """The lights of a portrait, which stand still relative to the camera; all colours linear.
 
-    lights : up to three   sky, ground : ambient light from above and below   mirror : surroundings seen at grazing angles
+    lights : up to three   sky, ground : ambient light from above and below
+    mirror : surroundings seen at grazing angles
     """
 
     lights: tuple[Light, ...] = (
@@ -188,13 +194,14 @@ def _texel_tables(textures: Sequence[Texture]) -> tuple[NDArray[np.uint32], NDAr
     root = np.round(1023.0 * np.sqrt(linear(np.arange(256) / 255.0))).astype(np.uint32)
     count = np.array([len(t.levels) for t in textures] or [0], dtype=np.int32)
     level = np.zeros((len(count), max(int(count.max()), 1), 3), dtype=np.int32)
-    parts, first = [np.zeros(1, np.uint32)], 1
+    parts: list[NDArray[np.uint32]] = [np.zeros(1, np.uint32)]
+    first = 1
     for i, texture in enumerate(textures):
         for j, picture in enumerate(texture.levels):
             h, w = picture.shape[:2]
             level[i, j] = first, w, h
-            word = root[picture]
-            parts.append((word[..., 0] | word[..., 1] << 10 | word[..., 2] << 20).ravel())
+            red, green, blue = (root[picture[..., c]].ravel() for c in range(3))
+            parts.append(red | green << np.uint32(10) | blue << np.uint32(20))
             first += h * w
     return np.concatenate(parts), level, count
 

@@ -9,7 +9,7 @@ from faceanim.kernels import raster, shadow
 from faceanim.render.camera import Camera
 
 SIZE = 256
-REACH = 2
+REACH = 3
 _FARNESS = 10.0
 
 
@@ -31,7 +31,9 @@ class ShadowMap:
             item=np.ascontiguousarray(mesh.item[casts]),
             uv=np.ascontiguousarray(mesh.uv[casts]),
         )
-        self._paint = paint
+        material = paint.material.copy()
+        material[:, raster.M_SIDED] = 0.0  # back sides lie behind fronts
+        self._paint = paint._replace(material=material)
         self._frame = raster.buffers(len(points), len(self._mesh.triangle), SIZE, SIZE)
         used = points[np.unique(self._mesh.triangle)]
         self._centre = 0.5 * (used.min(axis=0) + used.max(axis=0))
@@ -53,7 +55,7 @@ class ShadowMap:
         if raster.band_pass(frame) > len(frame.row_list):
             frame = self._frame = raster.longer_list(frame)
             raster.band_pass(frame)
-        raster.coverage_pass(1, mesh, number, frame)
+        raster.coverage_pass(1, False, mesh, number, frame)
         far = 2.0 * self._radius
         shadow.moment_pass(number, distance, far, REACH, frame.sample, self._moment, self._spare)
         to_light = np.zeros(16, np.float32)

@@ -10,7 +10,7 @@ from picture_shapes import ball
 from faceanim.ground.errors import RunError, UserError
 from faceanim.render.camera import Camera
 from faceanim.render.renderer import DrawItem, Renderer
-from faceanim.render.shading import Background, Lighting, Look, Material, Texture, linear
+from faceanim.render.shading import Background, Light, Lighting, Look, Material, Texture, linear
 
 SIZE = 64
 BLACK = Look(background=Background((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
@@ -38,7 +38,7 @@ def triangle(corners: object, material: Material = WHITE) -> DrawItem:
 
 
 def square(half: float, z: float, material: Material, x: float = 0.0) -> DrawItem:
-    corner = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + (x, 0.0)
+    corner = np.array([[x - half, -half], [x + half, -half], [x + half, half], [x - half, half]])
     uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     return DrawItem(np.column_stack([corner, np.full(4, z)]), np.array([[0, 1, 2], [0, 2, 3]]), material, uv)
 
@@ -265,3 +265,30 @@ def test_wrong_requests_are_refused() -> None:
         DrawItem(item.points, np.array([[0, 1, 9]]), WHITE)
     with pytest.raises(UserError, match="uv"):
         DrawItem(item.points, item.triangles, plain(1.0, texture=Texture.of(np.zeros((2, 2, 3), np.uint8))))
+
+
+def test_key_light_throws_a_soft_shadow() -> None:
+    """A plate before a wall darkens the wall away from the light, not towards it, softly, and only if asked to."""
+    grey = Material(colour=(0.7, 0.7, 0.7), specular=0.0, casts=True)
+    items = [square(120.0, -40.0, grey), square(8.0, 0.0, grey)]
+    lamp = Lighting(lights=(Light((-0.6, 0.0, 0.8), (0.7, 0.7, 0.7)),))
+    row = {}
+    for shadow in (True, False):
+        look = Look(lamp, BLACK.background, shadow)
+        row[shadow] = linear(Renderer(SIZE, CAMERA, items, look=look).draw()[SIZE // 2, :, 0] / 255.0)
+    part = row[True] / row[False]
+    shade = 32 + int(40 * 0.6 / 0.8)
+    assert part[shade] < 0.75
+    np.testing.assert_allclose(part[:24], 1.0, atol=0.02)
+    assert (np.abs(np.diff(part[shade - 20 :])) < 0.2).all()
+
+
+def test_lying_surfaces_throw_no_shadow_on_themselves() -> None:
+    """A lit ball that casts shadows looks as one that does not, wherever the light falls on it."""
+    points, quads = ball((0.0, 0.0, 0.0), 28.0, 48)
+    look = Look(Lighting(), BLACK.background)
+    one, two = (
+        picture(DrawItem(points, quads, Material(specular=0.0, casts=casts)), look=look).astype(int)
+        for casts in (True, False)
+    )
+    assert np.abs(one - two).max() <= 12 and np.abs(one - two).mean() < 0.5

@@ -93,13 +93,15 @@ class Tables:
         weight = 0.5 * body.attachment.shear[:, None] * np.clip(cotangent, 0.0, 10.0)
         return np.bincount(self.edge_of.ravel(), weights=weight.ravel(), minlength=len(self.edges))
 
-    def _local_shear(self, local: Ints, n: int) -> tuple[Ints, Ints, Floats]:
-        """Return start, neighbour and stiffness of the shear layer's ties between the `n` vertices of a patch."""
+    def _local_shear(self, local: Ints, n: int) -> tuple[Ints, Ints, Floats, Floats]:
+        """Return start, neighbour, stiffness and its sums of the shear layer's ties between the `n` vertices of a patch."""
         keep = (local[self.edges] >= 0).all(axis=1) & (self.shear > 0.0)
         pairs, shear = local[self.edges[keep]], self.shear[keep]
         lists = topology.grouped(pairs.T.ravel(), np.arange(2 * len(pairs), dtype=np.int32), n)
         other = pairs[:, ::-1].T.ravel()[lists.item]
-        return lists.start, np.ascontiguousarray(other, dtype=np.int32), np.tile(shear, 2)[lists.item]
+        both = np.tile(shear, 2)[lists.item]
+        total = np.bincount(pairs.T.ravel(), weights=np.tile(shear, 2), minlength=n)
+        return lists.start, np.ascontiguousarray(other, dtype=np.int32), both, total
 
     def _rest_gaps(self) -> None:
         """Shrink each clearance to the gap at rest, so that a body at rest feels no contact."""

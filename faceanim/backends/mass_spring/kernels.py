@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from faceanim.ground.jit import kernel
-from faceanim.kernels.attachment import carry, growth, shear_force, tether_force
+from faceanim.kernels.attachment import carry, find_shift, growth, tether_force, tie
 from faceanim.kernels.contact import find, plane_force, plane_gap
 from faceanim.kernels.muscles import aim, fibre_force, pull_of
 from faceanim.kernels.springs import elastic_force
@@ -21,7 +23,8 @@ from faceanim.kernels.tangent import height_terms
 def total_force(x, scene, moment, scratch, force):
     """Write springs, tethers, muscles and known contacts at `x` (n, 3) into `force` (n, 4)."""
     elastic_force(x, scene.springs, scene.law, scratch, force)
-    tether_force(x, moment.anchor, scene.tethers, scene.free, force)
+    find_shift(x, moment.anchor, moment.shift)
+    tether_force(moment.shift, scene.tethers, scene.free, force)
     fibre_force(x, moment, scene.free, force)
     plane_force(x, moment.planes, scene.colliders.stiffening, force)
 
@@ -102,39 +105,70 @@ def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, swe
     """
     middle = 0.5 * (high + low)
     half = 0.5 * (high - low)
-    rho = half / middle
+    rho = 0.0
     residual = 0.0
     wish = 0.0
+    best = np.inf
+    find_shift(x, moment.anchor, moment.shift)
+    move[:] = 0.0
     for sweep in range(sweeps):
-        total_force(x, scene, moment, scratch, force)
-        if sweep == 0:
-            keep = 0.0
-            gain = 1.0 / middle
-        else:
-            new = 1.0 / (2.0 * middle / half - rho)
-            keep = rho * new
-            gain = 2.0 * new / half
-            rho = new
-        residual = 0.0
-        wish = 0.0
+        elastic_force(x, scene.springs, scene.law, scratch, force)
+        plane_force(x, moment.planes, scene.colliders.stiffening, force)
+        new = 1.0 / (2.0 * middle / half - rho)
+        keep = rho * new
+        gain = 2.0 * new / half if rho > 0.0 else 1.0 / middle
+        rho = new if rho > 0.0 else half / middle
+        residual, wish = sweep_moves(x, scene, moment, weight, centre, force, keep, gain, move)
+        if wish > 4.0 * best and high < 2.0:
+            # `high` was too low for this state: the bound 2 never is. Start over from here.
+            high = 2.0
+            middle = 0.5 * (high + low)
+            half = 0.5 * (high - low)
+            rho = 0.0
+            residual, wish = sweep_moves(x, scene, moment, weight, centre, force, 0.0, 1.0 / middle, move)
+        best = min(best, wish)
         for i in range(scene.free):
-            s = 1.0 / (weight[i] + force[i, 3])
-            gx = force[i, 0] - weight[i] * (x[i, 0] - centre[i, 0])
-            gy = force[i, 1] - weight[i] * (x[i, 1] - centre[i, 1])
-            gz = force[i, 2] - weight[i] * (x[i, 2] - centre[i, 2])
-            r = gx * gx + gy * gy + gz * gz
-            residual = max(residual, r)
-            wish = max(wish, r * s * s)
-            s *= gain
-            move[i, 0] = keep * move[i, 0] + s * gx
-            move[i, 1] = keep * move[i, 1] + s * gy
-            move[i, 2] = keep * move[i, 2] + s * gz
-            x[i, 0] += move[i, 0]
-            x[i, 1] += move[i, 1]
-            x[i, 2] += move[i, 2]
+            for d in range(3):
+                x[i, d] += move[i, d]
+                moment.shift[i, d] += move[i, d]
         if wish < tolerance * tolerance:
             return sweep + 1, math.sqrt(residual), math.sqrt(wish)
     return sweeps, math.sqrt(residual), math.sqrt(wish)
+
+
+@kernel
+def sweep_moves(x, scene, moment, weight, centre, force, keep, gain, move):
+    """Write the next `move` (n, 3) of a sweep: `keep` times the last one plus `gain` times the Jacobi step.
+
+    force : (n, 4) springs and contacts; tethers and muscles are added here
+    Returns the largest squared residual [mN^2] and squared Jacobi step [mm^2].
+    """
+    residual = 0.0
+    wish = 0.0
+    for i in range(scene.free):
+        fx, fy, fz, k, _ = tie(moment.shift, i, scene.tethers)
+        px = x[i, 0]
+        py = x[i, 1]
+        pz = x[i, 2]
+        for e in range(moment.first[i], moment.first[i + 1]):
+            ux, uy, uz, ku = pull_of(e, px, py, pz, moment)
+            fx += ux
+            fy += uy
+            fz += uz
+            k += ku
+        w = weight[i]
+        s = 1.0 / (w + k + force[i, 3])
+        fx += force[i, 0] - w * (px - centre[i, 0])
+        fy += force[i, 1] - w * (py - centre[i, 1])
+        fz += force[i, 2] - w * (pz - centre[i, 2])
+        r = fx * fx + fy * fy + fz * fz
+        residual = max(residual, r)
+        wish = max(wish, r * s * s)
+        s *= gain
+        move[i, 0] = keep * move[i, 0] + s * fx
+        move[i, 1] = keep * move[i, 1] + s * fy
+        move[i, 2] = keep * move[i, 2] + s * fz
+    return residual, wish
 
 
 @kernel(inline=True)
@@ -173,7 +207,8 @@ def height_push(ix, iy, iz, ax, ay, az, bx, by, bz, rest, stiffness, repulsion, 
 def vertex_force(i, px, py, pz, x, scene, moment):
     """Return the force on free vertex `i` if it were at p and the others at `x`, its stiffness bound and secant sum.
 
-    (fx, fy, fz, k, k_secant): springs, tether and muscles; contacts not. The secant sum is the paper's (Eq. 18), which
+    (fx, fy, fz, k, k_secant): springs, tether and muscles; contacts not. `moment.shift` must hold the others' positions
+    minus their anchors; row `i` is written. The secant sum is the paper's (Eq. 18), which
     a compressed spring makes negative.
     """
     springs = scene.springs
@@ -236,25 +271,15 @@ def vertex_force(i, px, py, pz, x, scene, moment):
             fz -= t * uz
             k += 0.5 * abs(t) * (1.0 + abs(t) + abs(1.0 - t)) * kt
             ks += t * t * s
-    if scene.tethers.stiffness[i] > 0.0:
-        dx = px - moment.anchor[i, 0]
-        dy = py - moment.anchor[i, 1]
-        dz = pz - moment.anchor[i, 2]
-        secant, tangent = growth(
-            (dx * dx + dy * dy + dz * dz) / (scene.tethers.s0 * scene.tethers.s0), scene.tethers.alpha
-        )
-        secant *= scene.tethers.stiffness[i]
-        fx -= secant * dx
-        fy -= secant * dy
-        fz -= secant * dz
-        k += scene.tethers.stiffness[i] * tangent
-        ks += secant
-    sx, sy, sz, shear = shear_force(i, px, py, pz, x, moment.anchor, scene.tethers)
-    fx += sx
-    fy += sy
-    fz += sz
-    k += shear
-    ks += shear
+    moment.shift[i, 0] = px - moment.anchor[i, 0]
+    moment.shift[i, 1] = py - moment.anchor[i, 1]
+    moment.shift[i, 2] = pz - moment.anchor[i, 2]
+    ux, uy, uz, kt, s = tie(moment.shift, i, scene.tethers)
+    fx += ux
+    fy += uy
+    fz += uz
+    k += kt
+    ks += s
     for e in range(moment.first[i], moment.first[i + 1]):
         ux, uy, uz, kt = pull_of(e, px, py, pz, moment)
         fx += ux
@@ -305,6 +330,7 @@ def sweep_in_place(x, first, last, scene, moment, weight, centre, omega, head, l
 
     Returns the largest squared residual [mN^2] and wish [mm^2].
     """
+    find_shift(x, moment.anchor, moment.shift)
     residual = 0.0
     wish = 0.0
     for i in range(first, last):
@@ -321,6 +347,8 @@ def sweep_in_place(x, first, last, scene, moment, weight, centre, omega, head, l
         x[i, 0] += s * fx
         x[i, 1] += s * fy
         x[i, 2] += s * fz
+        for d in range(3):
+            moment.shift[i, d] = x[i, d] - moment.anchor[i, d]
     return residual, wish
 
 
@@ -334,9 +362,12 @@ def paper_step(x, v, ahead, scene, moment, mass, drag, h, secant, force, head, l
     for i in range(len(x)):
         for d in range(3):
             ahead[i, d] = x[i, d] + h * v[i, d]
+    find_shift(ahead, moment.anchor, moment.shift)
     worst = 0.0
     for i in range(scene.free):
         fx, fy, fz, k, ks = vertex_force(i, x[i, 0], x[i, 1], x[i, 2], ahead, scene, moment)
+        for d in range(3):
+            moment.shift[i, d] = ahead[i, d] - moment.anchor[i, d]
         cx, cy, cz, ck = chained_contacts(i, x, moment.planes, scene.colliders.stiffening, head, link)
         force[i, 0] = fx + cx
         force[i, 1] = fy + cy
@@ -425,7 +456,7 @@ def leapfrog(x, v, held, start, end, work, scene, moment, scratch, mass, drag, h
                 for d in range(3):
                     x[i, d] = moment.anchor[i, d]
         if n % 8 == 7:
-            find(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)
+            find(x, scene.colliders, scene.grids, moment.pose, reach, 0.5 * reach, moment.planes)
         total_force(x, scene, moment, scratch, force)
         worst = 0.0
         for i in range(scene.free):

@@ -28,7 +28,8 @@ class Load:
         pose = np.zeros((patch.scene.tethers.bone_weight.shape[1], 4, 4))
         planes = build.room_for_planes(patch.scene.colliders, n)
         self.moment = Moment(
-            np.zeros((n, 3)), pose, np.zeros(n + 1, dtype=np.int32), np.zeros((e, 3)), np.zeros(e), np.zeros(e), planes
+            np.zeros((n, 3)), pose, np.zeros(n + 1, dtype=np.int32), np.zeros((e, 3)), np.zeros(e), np.zeros(e), planes,
+            np.zeros((n, 3)),
         )
         self.activation = np.zeros(patch.muscles)
         self.scratch = force_scratch(patch.scene.springs)
@@ -42,10 +43,10 @@ class Load:
         self.activation[:] = control.activation
         muscles.aim(scene.fibres, control.activation, moment.pose, moment)
 
-    def touch(self, x: Floats, reach: float) -> None:
-        """Find the contacts nearer than `reach` [mm] at `x`."""
-        scene = self.patch.scene
-        contact.find(x, scene.colliders, scene.grids, self.moment.pose, reach, self.moment.planes)
+    def touch(self, x: Floats, reach: float, pair_reach: float | None = None) -> None:
+        """Find the contacts nearer than `reach` [mm] at `x`, those of lips and lids nearer than `pair_reach`."""
+        scene, near = self.patch.scene, reach if pair_reach is None else pair_reach
+        contact.find(x, scene.colliders, scene.grids, self.moment.pose, reach, near, self.moment.planes)
 
     def forces(self, x: Floats) -> Floats:
         """Return the forces at `x` with the stiffness bounds, (n, 4): springs, tethers, muscles and known contacts."""

@@ -14,10 +14,16 @@ from faceanim.backends.solver import StepReport
 from faceanim.ground.arrays import Floats
 from faceanim.kernels.tables import Drive
 
-REACH = 2.0
+REACH = 1.5
 """Contacts within this distance [mm] of their clearance are watched during a step."""
+PAIR_REACH = 0.6
+"""The same for lips and lids, whose search is the dearest."""
 HIGHEST = 2.0
 """No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
+MARGIN = 1.06
+"""What is added to the largest such eigenvalue measured at rest; it hardly changes when the skin deforms."""
+RESOLVED = 1.5
+"""n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
 SETTLED = 0.02
 """A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
 OMEGA = 1.5
@@ -88,7 +94,7 @@ class _Implicit(_Patchwise):
             now, before, self.centre, self.weight,
         )  # fmt: skip
         kernels.extrapolate(x, self.v, h)
-        self.load.touch(x, REACH)
+        self.load.touch(x, REACH, PAIR_REACH)
         self._minimise(gamma, report)
         kernels.finish(
             x, motion.q, motion.q_before, patch.nodes, patch.m, gamma, now, before, motion.q_new, motion.qd_new
@@ -104,15 +110,15 @@ class BlockDescent(_Implicit):
     def __init__(self, load: Load, drag: float, options: Options) -> None:
         super().__init__(load, drag, options)
         self.move = np.zeros_like(self.centre)
-        self.stiffness = rest_stiffness(load)
+        self.spectrum = Spectrum(load)
         self._gamma = self._low = 0.0
 
     def _minimise(self, gamma: float, report: StepReport) -> None:
         load, options = self.load, self.options
         if gamma != self._gamma:
-            self._gamma, self._low = gamma, lowest(load, self.weight, self.stiffness, options.sweeps)
+            self._gamma, self._low = gamma, self.spectrum.low(self.weight, options.sweeps)
         sweeps, residual, wish = kernels.accelerated_sweeps(
-            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self._low, HIGHEST,
+            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self._low, self.spectrum.high,
             options.sweeps, options.sweep_tolerance, load.force, self.move,
         )  # fmt: skip
         report.iterations += sweeps
@@ -131,7 +137,8 @@ class QuasiStatic(_Patchwise):
         self.move = np.zeros((n, 3))
         self.head = np.full(n, -1, dtype=np.int32)
         self.link = np.zeros(4 * len(load.moment.planes.offset), dtype=np.int32)
-        self.low = lowest(load, self.weight, rest_stiffness(load), options.passes)
+        self.spectrum = Spectrum(load)
+        self.low = self.spectrum.low(self.weight, options.passes)
 
     def advance(self, motion: Motion, h: float, report: StepReport) -> None:
         """Move the free vertices after those of `motion.q_new`, which have gone ahead."""
@@ -139,11 +146,12 @@ class QuasiStatic(_Patchwise):
         kernels.gather(motion.q_new, motion.qd, patch.nodes, patch.held, load.moment, x, self.v)
         self.v[patch.m :] = 0.0
         kernels.extrapolate(x, self.v, h)
-        load.touch(x, REACH)
+        load.touch(x, REACH, PAIR_REACH)
         options, scene = self.options, patch.scene
         if options.quasi_static == "chebyshev":
             kernels.accelerated_sweeps(
-                x, scene, load.moment, load.scratch, self.weight, self.centre, self.low, HIGHEST, options.passes,
+                x, scene, load.moment, load.scratch, self.weight, self.centre, self.low, self.spectrum.high,
+                options.passes,
                 options.sweep_tolerance, load.force, self.move,
             )  # fmt: skip
         else:
@@ -179,7 +187,7 @@ class SemiImplicit(_Patchwise):
         """Advance by one step."""
         load = self.load
         self._gather(motion)
-        load.touch(load.x, REACH)
+        load.touch(load.x, REACH, PAIR_REACH)
         residual = kernels.semi_implicit_step(
             load.x, self.v, load.patch.scene, load.moment, load.scratch, load.patch.mass, self.drag, h, load.force
         )
@@ -201,7 +209,7 @@ class Paper(_Patchwise):
         """Advance by one step."""
         load = self.load
         self._gather(motion)
-        load.touch(load.x, REACH)
+        load.touch(load.x, REACH, PAIR_REACH)
         kernels.contact_chains(load.moment.planes, self.head, self.link)
         residual = kernels.paper_step(
             load.x, self.v, self.ahead, load.patch.scene, load.moment, load.patch.mass, self.drag, h,
@@ -234,7 +242,7 @@ class Explicit(_Patchwise):
         if motion.t != self.reached:
             self._stand(self.end)
         kernels.at_share(self.start, self.end, 0.0, self.work, patch.scene, load.moment)
-        load.touch(load.x, REACH)
+        load.touch(load.x, REACH, PAIR_REACH)
         substeps = kernels.substeps_needed(
             load.x, patch.scene, load.moment, load.scratch, patch.mass, self.drag, h, self.options.safety, load.force
         )
@@ -272,22 +280,42 @@ SCHEMES: dict[str, type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | 
 }
 
 
-def rest_stiffness(load: Load) -> Floats:
-    """Return the stiffness bound of every vertex of a patch at rest, (n,) [mN/mm]."""
-    load.x[:] = load.patch.scene.tethers.rest
-    load.touch(load.x, 0.0)
-    return load.forces(load.x)[:, 3].copy()
+class Spectrum:
+    """The eigenvalues of a patch's stiffness divided by its stiffness bounds: what sweeps must damp."""
 
+    def __init__(self, load: Load) -> None:
+        self.load = load
+        load.x[:] = load.patch.scene.tethers.rest
+        load.touch(load.x, 0.0)
+        self.stiffness = load.forces(load.x)[:, 3].copy()
+        self.high = min(HIGHEST, MARGIN * self._largest())
 
-def lowest(load: Load, weight: Floats, stiffness: Floats, sweeps: int) -> float:
-    """Return the lower end of the eigenvalues that `sweeps` sweeps should damp.
+    def _largest(self) -> float:
+        """Return the largest eigenvalue at rest, by power iteration on differences of forces."""
+        load, m, step = self.load, self.load.patch.m, 1e-4
+        if m == 0:
+            return 1.0
+        base = load.forces(load.x)[:m, :3].copy()
+        k = np.maximum(self.stiffness[:m, None], 1e-12)
+        direction = np.random.default_rng(7).standard_normal((m, 3))
+        trial, value = load.x.copy(), 1.0
+        for _ in range(40):
+            direction /= np.sqrt((direction**2 * k).sum() / k.sum())
+            trial[:m] = load.x[:m] + step * direction
+            image = (base - load.forces(trial)[:m, :3]) / (step * k)
+            value = float((direction * image * k).sum() / (direction**2 * k).sum())
+            direction = image
+        return max(value, 1.0)
 
-    That is what inertia and tethers hold of a vertex's whole stiffness, but no less than so few sweeps can resolve.
-    """
-    m = load.patch.m
-    held = weight[:m] + load.patch.scene.tethers.stiffness[:m]
-    share = float(np.median(held / (weight[:m] + stiffness[:m]))) if m else 1.0
-    return min(0.9 * HIGHEST, max(share, HIGHEST * (2.0 / max(sweeps, 3)) ** 2))
+    def low(self, weight: Floats, sweeps: int) -> float:
+        """Return the lower end of what `sweeps` sweeps should damp.
+
+        That is what inertia and tethers hold of a vertex's whole stiffness, but no less than so few can resolve.
+        """
+        m = self.load.patch.m
+        held = weight[:m] + self.load.patch.scene.tethers.stiffness[:m]
+        share = float(np.median(held / (weight[:m] + self.stiffness[:m]))) if m else 1.0
+        return min(0.9 * self.high, max(share, self.high * (RESOLVED / max(sweeps, 2)) ** 2))
 
 
 def make_scheme(load: Load, drag: float, options: Options) -> Scheme:

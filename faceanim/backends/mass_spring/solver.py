@@ -50,7 +50,7 @@ class Pins:
         self.table = Tethers(
             body.surface.points[self.node], np.ascontiguousarray(body.attachment.bone_weight[self.node]),
             np.zeros(len(self.node)), 1.0, 1.0, np.zeros(len(self.node) + 1, dtype=np.int32),
-            np.zeros(0, dtype=np.int32), np.zeros(0),
+            np.zeros(0, dtype=np.int32), np.zeros(0), np.zeros(len(self.node)),
         )  # fmt: skip
         self.pose = np.zeros((len(body.bones), 4, 4))
         self.place = np.zeros((len(self.node), 3))
@@ -276,7 +276,7 @@ class SolverMassSpring:
         state_out.t = state_in.t + dt
 
     def _watch(self, state: State, report: StepReport) -> None:
-        farthest = float(np.abs(state.q).max(initial=0.0))
+        farthest = max(float(state.q.max(initial=0.0)), -float(state.q.min(initial=0.0)))
         if not farthest < self._horizon:
             remedy = {
                 "paper": "this scheme is unstable for large steps: use scheme='block_descent' or a smaller step",
