@@ -242,7 +242,7 @@ def _light_run(first, last, colour, ry, centre, focal, light, ambient, row, whol
         pl = _shine(nx, ny, nz, vx, vy, vz, rx, r_y, rz, fl, rough, f0) * shiny
         # The shadow leaves alone the light that seeps round from the lit side, and reddens at its rim.
         lit = load(number, A_LIT * cap + i)
-        edge = _4 * fk
+        edge = _4 * (fk - _EDGE)
         edge = edge if edge > _0 else _0
         edge = edge if edge < _1 else _1
         lit = _1 - edge * (_1 - lit)

@@ -17,8 +17,6 @@ FREEZE = 0.05
 """Contacts are found anew after steps longer than this [mm]; after shorter ones they stay until the end is reached."""
 STILL = 1e-3
 """The contacts are final when the way to the minimum with them was about as short as this [mm]."""
-MOST_ROUNDS = 6
-"""After so many minima the contacts are final in any case: a vertex on a crease may hop between two of them."""
 MOST_REFRESHES = 60
 HEIGHT_SHARE = 0.6
 """No step may use up more than this share of a triangle's height: beyond it the triangle would turn over."""
@@ -71,13 +69,21 @@ class Newton:
         self.nowhere = np.zeros((n, 3))
 
     def minimise(
-        self, x: Floats, *, weight: Floats | None = None, centre: Floats | None = None, tolerance: float, most: int
+        self,
+        x: Floats,
+        *,
+        weight: Floats | None = None,
+        centre: Floats | None = None,
+        tolerance: float,
+        most: int,
+        most_rounds: int = 6,
     ) -> NewtonReport:
         """Move the free vertices of `x` (n, 3) to the minimum; stop when a full step moves none by `tolerance` [mm].
 
         Trust region: the step stays within a radius that grows and shrinks with the success of the quadratic model.
         Contacts are half spaces, found anew after every step as long as steps are long, and again once the minimum
-        with them has been reached, until that moves nothing any more.
+        with them has been reached, until that moves nothing any more or `most_rounds` minima have been seen (a vertex
+        on a crease may hop between two of them for ever).
         """
         self.weight = self.zero if weight is None else weight
         self.centre = self.nowhere if centre is None else centre
@@ -100,7 +106,7 @@ class Newton:
             near = full and report.movement < STILL
             if near and not polish:
                 rounds += 1
-                polish = self.travel < 2.0 * STILL or rounds == MOST_ROUNDS
+                polish = self.travel < 2.0 * STILL or rounds == most_rounds
             if not polish and (near or (report.movement > FREEZE and refreshes < MOST_REFRESHES)):
                 refreshes += 1
                 self._refresh(x, report)

@@ -173,7 +173,7 @@ class FullNewton(_Implicit):
     def _minimise(self, gamma: float, report: StepReport) -> None:
         done = self.newton.minimise(
             self.load.x, weight=self.weight, centre=self.centre, tolerance=self.options.newton_tolerance,
-            most=self.options.newton_most,
+            most=self.options.newton_most, most_rounds=2,
         )  # fmt: skip
         report.iterations += done.steps
         report.residual = max(report.residual, done.residual)
