@@ -130,7 +130,7 @@ def two_lips(gap: float = 0.3) -> Body:
     start = np.arange(2 * n + 1, dtype=np.int32) * t
     other = np.concatenate([np.tile(np.arange(t, 2 * t), n), np.tile(np.arange(t), n)]).astype(np.int32)
     pull = Muscles(
-        ("press",), np.array([400.0]), np.zeros(2 * n, np.int32), node, np.full(2 * n, 0.5 / n),
+        ("press",), np.array([1600.0]), np.zeros(2 * n, np.int32), node, np.full(2 * n, 0.5 / n),
         np.full(2 * n, PULL_ALONG, np.int32), np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], n, axis=0),
         np.zeros(2 * n, np.int32), np.ones(2 * n),
     )  # fmt: skip
@@ -140,7 +140,7 @@ def two_lips(gap: float = 0.3) -> Body:
         mass=surface.vertex_areas * 4e-6,
         membrane_modulus=np.full(2 * t, 40.0),
         pinned=np.zeros(2 * n, dtype=bool),
-        attachment=Attachment(np.ones((2 * n, 1)), np.full(2 * n, 0.3)),
+        attachment=Attachment(np.ones((2 * n, 1)), np.full(2 * n, 5.0)),
         muscles=pull,
         bones=(Bone("cranium"),),
         pairs=(PairContact("lips", node, start, other, gap),),

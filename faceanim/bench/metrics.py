@@ -110,26 +110,17 @@ class SkinCheck:
         self.body = body
         rest = body.surface.points
         self._turned = _against_surroundings(rest, body.surface.triangles)
-        self._gaps = [_PairGap(pair, body.surface.triangles) for pair in body.pairs]
-        normals = _vertex_normals(rest, body.surface.triangles)[1]
-        self._rest_gaps = [gap.measure(rest, normals) for gap in self._gaps]
+        self._crossings = [_Crossing(pair, body.surface) for pair in body.pairs]
         self._bone_rows = _bone_rows(body)
 
     def at(self, points: Floats, control: Control) -> Soundness:
         """Return how sound the skin is at `points` (n, 3) [mm] under `control`."""
         points = np.asarray(points)
-        normals = _vertex_normals(points, self.body.surface.triangles)[1]
-        crossed = {
-            gap.pair.name: float(
-                np.max(np.maximum(-gap.measure(points, normals), 0.0) - np.maximum(-rest, 0.0), initial=0.0)
-            )
-            for gap, rest in zip(self._gaps, self._rest_gaps)
-        }
         return Soundness(
             inverted_triangles=int((_against_surroundings(points, self.body.surface.triangles) & ~self._turned).sum()),
             depth_in_bone=self._depth_in_bone(points, control),
             depth_in_eyeball=max((_depth_in_sphere(sphere, points) for sphere in self.body.spheres), default=0.0),
-            depth_crossed=crossed,
+            depth_crossed={crossing.name: crossing.depth(points) for crossing in self._crossings},
         )
 
     def _depth_in_bone(self, points: Floats, control: Control) -> float:
@@ -197,74 +188,61 @@ def _depth_in_sphere(sphere: SphereContact, points: Floats) -> float:
 
 
 def crossing_depth(mesh: TriMesh, pair: PairContact, points: Floats) -> float:
-    """Return how deep [mm] a vertex of one sheet lies behind the other sheet, beyond what is so at rest."""
-    gap = _PairGap(pair, mesh.triangles)
-    before, after = (gap.measure(p, _vertex_normals(p, mesh.triangles)[1]) for p in (mesh.points, points))
-    return float(np.max(np.maximum(-after, 0.0) - np.maximum(-before, 0.0), initial=0.0))
+    """Return how deep [mm] one sheet of `pair` has gone through the other (or itself), 0 if nothing crosses."""
+    crossing = _Crossing(pair, mesh)
+    return max(0.0, crossing.depth(points))
 
 
-class _PairGap:
-    """Signed distance of each vertex of a pair contact to the other sheet, where that is within `reach` [mm]."""
+class _Crossing:
+    """Edges of two sheets that pass through their triangles, where they did not at rest.
 
-    def __init__(self, pair: PairContact, triangles: Ints, reach: float = 4.0) -> None:
-        self.pair, self.reach = pair, reach
-        count = np.diff(pair.start)
-        self._watched = np.flatnonzero(count)
-        self._owner = np.repeat(np.arange(len(self._watched)), count[self._watched])
-        self._first = pair.start[:-1][self._watched]
-        unique, self._triangle = np.unique(pair.triangle, return_inverse=True)
-        self._corners = triangles[unique]
+    The depth of a crossing is the distance of the edge's nearer end from the plane of the triangle it goes through.
+    """
 
-    def measure(self, points: Floats, normals: Floats) -> Floats:
-        """Return the distances (c,) [mm], negative behind; `reach` where no triangle is near."""
-        gap = np.full(len(self.pair.node), self.reach)
-        if not len(self._owner):
-            return gap
-        node = self.pair.node[self._watched]
-        row = self._candidates(points, node)
-        corners = self._corners[self._triangle[row]]
-        x = points[node[self._owner[row]]]
-        bary = closest_on_triangles(x, *(points[corners[:, k]] for k in range(3)))
-        foot = np.einsum("ek,ekj->ej", bary, points[corners])
-        normal = np.einsum("ek,ekj->ej", bary, normals[corners])
-        distance = np.linalg.norm(x - foot, axis=1)
-        sign = np.where(np.einsum("ij,ij->i", x - foot, normal) < 0.0, -1.0, 1.0)
-        order = np.argsort(-distance, kind="stable")
-        order = order[distance[order] < self.reach]
-        gap[self._watched[self._owner[row[order]]]] = (sign * distance)[order]
-        return gap
+    def __init__(self, pair: PairContact, mesh: TriMesh) -> None:
+        self.name = pair.name
+        self._corners = mesh.triangles[np.unique(pair.triangle)]
+        sides = np.sort(self._corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        self._edges = np.unique(sides, axis=0) if len(sides) else sides
+        self._at_rest: set[int] = set()
+        self._at_rest = set(self._crossings(mesh.points)[0].tolist())
 
-    def _candidates(self, points: Floats, node: Ints) -> Ints:
-        """Return the (vertex, triangle) rows that can hold the nearest triangle, by the triangles' bounding spheres."""
-        corner = points[self._corners]
-        centre = corner.mean(axis=1)
-        size = np.sqrt(((corner - centre[:, None]) ** 2).sum(axis=2).max(axis=1))[self._triangle]
-        apart = points[node][self._owner] - centre[self._triangle]
-        distance = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-        bound = np.minimum.reduceat(distance + size, self._first)
-        low = distance - size
-        return np.flatnonzero((low <= bound[self._owner]) & (low < self.reach)).astype(np.int32)
+    def depth(self, points: Floats) -> float:
+        """Return the depth [mm] of the deepest crossing at `points` (n, 3), 0 if there is none."""
+        where, depth = self._crossings(points)
+        new = ~np.isin(where, list(self._at_rest))
+        return float(depth[new].max(initial=0.0))
 
+    def _crossings(self, points: Floats) -> tuple[Ints, Floats]:
+        """Return a number for each (edge, triangle) that cross, and its depth [mm]."""
+        edge, triangle = self._near(points)
+        p, q = (points[self._edges[edge, k]] for k in range(2))
+        a, b, c = (points[self._corners[triangle, k]] for k in range(3))
+        normal = np.cross(b - a, c - a)
+        size = np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
+        low, high = (np.einsum("ij,ij->i", x - a, normal) / size for x in (p, q))
+        cut = low * high < 0.0
+        t = low / np.where(cut, low - high, 1.0)
+        x = p + t[:, None] * (q - p)
+        for u, v in ((a, b), (b, c), (c, a)):
+            cut &= np.einsum("ij,ij->i", np.cross(v - u, x - u), normal) >= 0.0
+        depth = np.minimum(np.abs(low), np.abs(high))
+        return (edge * len(self._corners) + triangle)[cut], depth[cut]
 
-def closest_on_triangles(x: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
-    """Return the barycentric coordinates (e, 3) of the point of triangle (a, b, c)[e] closest to x[e], all (e, 3)."""
-    ab, ac, ax = b - a, c - a, x - a
-    d00, d01, d11 = (np.einsum("ij,ij->i", p, q) for p, q in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = (np.einsum("ij,ij->i", ax, p) for p in (ab, ac))
-    det = np.maximum(d00 * d11 - d01 * d01, 1e-30)
-    v, w = (d11 * d20 - d01 * d21) / det, (d00 * d21 - d01 * d20) / det
-    best = np.stack([1.0 - v - w, v, w], axis=1)
-    outside = (best < 0.0).any(axis=1)
-    corners, zero = (a, b, c), np.zeros(len(x))
-    nearest = np.full(len(x), np.inf)
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        edge = corners[j] - corners[i]
-        length = np.maximum(np.einsum("ij,ij->i", edge, edge), 1e-30)
-        t = np.clip(np.einsum("ij,ij->i", x - corners[i], edge) / length, 0.0, 1.0)
-        distance = np.linalg.norm(x - corners[i] - t[:, None] * edge, axis=1)
-        closer = outside & (distance < nearest)
-        nearest = np.where(closer, distance, nearest)
-        weights = [zero, zero, zero]
-        weights[i], weights[j] = 1.0 - t, t
-        best = np.where(closer[:, None], np.stack(weights, axis=1), best)
-    return best
+    def _near(self, points: Floats) -> tuple[Ints, Ints]:
+        """Return the (edge, triangle) pairs whose boxes overlap and that share no vertex."""
+        corner, ends = points[self._corners], points[self._edges]
+        order = np.argsort(corner[:, :, 0].min(axis=1), kind="stable") if len(corner) else np.zeros(0, np.int64)
+        low, high = corner[order].min(axis=1), corner[order].max(axis=1)
+        widest = float((high[:, 0] - low[:, 0]).max(initial=0.0))
+        first = np.searchsorted(low[:, 0], ends[:, :, 0].min(axis=1) - widest)
+        count = np.searchsorted(low[:, 0], ends[:, :, 0].max(axis=1), side="right") - first
+        edge = np.repeat(np.arange(len(ends)), count)
+        row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count - first, count)
+        keep = np.ones(len(edge), dtype=bool)
+        for k in range(3):
+            start, stop = ends[:, :, k].min(axis=1)[edge], ends[:, :, k].max(axis=1)[edge]
+            keep &= (low[row, k] <= stop) & (high[row, k] >= start)
+        edge, triangle = edge[keep], order[row[keep]]
+        shared = (self._edges[edge][:, :, None] == self._corners[triangle][:, None, :]).any(axis=(1, 2))
+        return edge[~shared], triangle[~shared]

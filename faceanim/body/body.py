@@ -85,13 +85,17 @@ class BoneContact:
 
 @dataclass(frozen=True, eq=False)
 class SphereContact:
-    """Vertices `node` (c,) kept at least `clearance` (c,) [mm] outside a fixed sphere (an eyeball)."""
+    """Vertices `node` (c,) kept at least `clearance` (c,) [mm] outside a fixed sphere (an eyeball).
+
+    hardness : [-] factor on the body's contact stiffness
+    """
 
     name: str
     centre: Floats
     radius: float
     node: Ints
     clearance: Floats
+    hardness: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

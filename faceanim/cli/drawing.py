@@ -125,7 +125,8 @@ def _values_of(session: Session, colour: str) -> Callable[[Floats], Any]:
 
 def _scale(colour: str, values: Sequence[Floats]) -> Scale:
     """Return a scale with a round top that spans `values`."""
-    largest = max((float(np.quantile(np.abs(v), 0.999)) for v in values), default=0.0)
+    share = 1.0 if colour == "displacement" else 0.99
+    largest = max((float(np.quantile(np.abs(v), share)) for v in values), default=0.0)
     top = _round_up(max(largest, 1.0))
     if colour == "displacement":
         return Scale(0.0, top, "displacement [mm]")

@@ -43,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     with Progress(quiet=args.quiet) as progress:
         rows = _measure(sessions, size, threads, progress, accuracy=not args.no_accuracy)
         progress.stage("comparing the work of a part of the mesh with all of it")
-        shares = framerate.shares(sessions[0])
+        chosen = next((one for one in sessions if one.expression.name == "happiness"), sessions[0])
+        shares = framerate.shares(chosen)
     computer = machine()
     _print(rows, shares, computer)
     record = {"machine": computer, "size": size, "rows": rows, "published": framerate.PAPER, "shares": shares}

@@ -25,6 +25,17 @@ SHEET_VIEW = 360
 POINTS = "points.npy"
 
 
+def faults(found: Soundness, allowed: float = 0.1) -> list[str]:
+    """Return what is not sound about the skin, in words; depths below `allowed` [mm] are within the contact's play."""
+    words = []
+    if found.inverted_triangles:
+        words.append(f"{found.inverted_triangles} triangles are turned over")
+    depths = {"bone": found.depth_in_bone, "an eyeball": found.depth_in_eyeball}
+    words += [f"skin lies {depth:.2g} mm inside {what}" for what, depth in depths.items() if depth > allowed]
+    words += [f"{name} cross by {depth:.2g} mm" for name, depth in found.depth_crossed.items() if depth > allowed]
+    return words
+
+
 class Production:
     """One run of `faceanim express`; call `simulate`, `draw`, `measure`, `record` in this order.
 
@@ -70,6 +81,8 @@ class Production:
             checks.append(skin.at(self.positions[frame], session.control(self.intensity(frame))))
             self.progress.advance()
         self.soundness = soundest(checks)
+        for fault in faults(self.soundness):
+            self.progress.note(f"warning: {fault} in the worst frame")
 
     def draw(self, *, film: bool) -> None:
         """Draw every frame into PNG files and the film, then the contact sheet."""

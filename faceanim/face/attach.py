@@ -81,11 +81,11 @@ def bone_contact(
     )
 
 
-def eyeball_contact(points: Floats, name: str, centre: Floats, radius: float, clearance: float) -> SphereContact:
+def eyeball_contact(points: Floats, name: str, centre: Floats, radius: float, clearance: float, hardness: float) -> SphereContact:
     """Return the contact of all skin within 5 mm of an eyeball with it."""
     gap = np.linalg.norm(points - centre, axis=1) - radius
     node = np.flatnonzero(gap < 5.0).astype(np.int32)
-    return SphereContact(name, centre, radius, node, np.minimum(clearance, 0.9 * np.maximum(gap[node], 0.0)))
+    return SphereContact(name, centre, radius, node, np.minimum(clearance, 0.9 * np.maximum(gap[node], 0.0)), hardness)
 
 
 def pair_contact(mesh: TriMesh, name: str, upper: Ints, lower: Ints, reach: float, gap: float) -> PairContact:

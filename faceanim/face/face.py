@@ -230,7 +230,7 @@ class Face:
             bones=(Bone("cranium", self.skull.cranium_grid), Bone("jaw", self.skull.jaw_grid)),
             bone_contact=self._bone_contact(),
             spheres=tuple(
-                attach.eyeball_contact(mesh.points, f"eye_{s}", e.centre, e.radius, contact.eye_clearance)
+                attach.eyeball_contact(mesh.points, f"eye_{s}", e.centre, e.radius, contact.eye_clearance, contact.eye_hardness)
                 for s, e in self.eyes.items()
             ),
             pairs=tuple(self._pairs()),
@@ -244,15 +244,25 @@ class Face:
         reach = 10.0
         return attach.bone_contact(self.mesh.points, movable, grids, reach, self.tissue.contact.bone_clearance)
 
+    def _lip(self, which: str) -> Ints:
+        """The vermilion of a lip without the commissures, where both lips are one skin and cannot cross."""
+        node = self.contact_sets[f"lip_{which}"]
+        corner = abs(float(self.mesh.points[self.landmarks["cheilion_left"], 0]))
+        inner = np.abs(self.mesh.points[node, 0]) < corner - _COMMISSURE
+        return node[(self.region[node] == LIP) & inner]
+
     def _pairs(self) -> list[Any]:
         sets = self.contact_sets
         gap = self.tissue.contact.gap
-        out = [attach.pair_contact(self.mesh, "lips", sets["lip_upper"], sets["lip_lower"], 8.0, gap)]
+        out = [attach.pair_contact(self.mesh, "lips", self._lip("upper"), self._lip("lower"), 8.0, gap)]
         for side in EYES:
             upper, lower = sets[f"lid_upper_{side}"], sets[f"lid_lower_{side}"]
             out.append(attach.pair_contact(self.mesh, f"lids_{side}", upper, lower, 14.0, gap))
         return out
 
+
+_COMMISSURE = 2.5
+"""Width of the mouth corner [mm]."""
 
 _CONTACT_SETS = (
     "lip_upper", "lip_lower", "lid_upper_left", "lid_lower_left", "lid_upper_right", "lid_lower_right",

@@ -59,9 +59,11 @@ class Inertia(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """stiffness [mN/mm per mm^2]; clearances [mm] to bone and eyeball; gap [mm] between lips and lids."""
+    """stiffness [mN/mm per mm^2]; eye_hardness [-] its factor on the eyeball; clearances [mm] to bone and eyeball;
+    gap [mm] between lips and lids."""
 
     stiffness: float
+    eye_hardness: float
     bone_clearance: float
     eye_clearance: float
     gap: float

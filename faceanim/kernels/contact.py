@@ -2,7 +2,8 @@
 
 `find` turns every contact that is near enough into a half space (a plane) at the current positions; the others work
 on planes alone. At the positions where it was made, a plane has the value and the gradient of the true gap.
-Penalty of depth p: energy P A (p^2 / 2 + p^4 / (4 s^2)), so stiffening that true penetration stays out of reach.
+Penalty of depth p: energy P A (p^2 / 2 + p^4 / (4 s^2)), so stiffening that true penetration stays out of reach;
+from p = 2 s on it goes on with the tangent reached, so that a deep start does not explode.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 from faceanim.ground.jit import kernel
 from faceanim.kernels.linalg3 import add_outer
 
-DEEPEST = 4.0
+DEEPEST = 2.5
 """A vertex farther behind the other lip than this [mm] belongs to something else."""
 
 
@@ -388,20 +389,32 @@ def spread(planes, c, s, y):
             y[j, 2] -= w * nz
 
 
+@kernel(inline=True)
+def penalty(p, stiffening):
+    """Return energy, force and tangent at depth `p` > 0 of a contact of unit stiffness."""
+    limit = 2.0 * stiffening
+    over = p - limit if p > limit else 0.0
+    p -= over
+    q = (p / stiffening) ** 2
+    force = p * (1.0 + q)
+    tangent = 1.0 + 3.0 * q
+    energy = p * p * (0.5 + 0.25 * q) + over * (force + 0.5 * over * tangent)
+    return energy, force + over * tangent, tangent
+
+
 @kernel
 def plane_force(x, planes, stiffening, force):
     """Add the penalty forces to `force` (n, 4), and their tangent stiffness to the stiffness bound of each vertex."""
     for c in range(planes.count[0]):
         p = -plane_gap(x, planes, c)
         if p > 0.0:
-            q = (p / stiffening) ** 2
-            spread(planes, c, planes.stiffness[c] * p * (1.0 + q), force)
-            k = planes.stiffness[c] * (1.0 + 3.0 * q)
+            _, f, k = penalty(p, stiffening)
+            spread(planes, c, planes.stiffness[c] * f, force)
+            k *= planes.stiffness[c]
+            force[planes.node[c, 0], 3] += k
             if planes.node[c, 1] >= 0:
-                k *= 2.0
                 for j in range(3):
                     force[planes.node[c, j + 1], 3] += k * planes.weight[c, j]
-            force[planes.node[c, 0], 3] += k
 
 
 @kernel
@@ -411,7 +424,8 @@ def plane_energy(x, planes, stiffening):
     for c in range(planes.count[0]):
         p = -plane_gap(x, planes, c)
         if p > 0.0:
-            total += planes.stiffness[c] * p * p * (0.5 + 0.25 * (p / stiffening) ** 2)
+            energy, _, _ = penalty(p, stiffening)
+            total += planes.stiffness[c] * energy
     return total
 
 
@@ -420,7 +434,10 @@ def plane_tangent(x, planes, stiffening, tangent):
     """Write the second derivative of each plane's penalty by its depth into `tangent` (c,) [mN/mm]; 0 = no touch."""
     for c in range(planes.count[0]):
         p = -plane_gap(x, planes, c)
-        tangent[c] = planes.stiffness[c] * (1.0 + 3.0 * (p / stiffening) ** 2) if p > 0.0 else 0.0
+        tangent[c] = 0.0
+        if p > 0.0:
+            _, _, k = penalty(p, stiffening)
+            tangent[c] = planes.stiffness[c] * k
 
 
 @kernel

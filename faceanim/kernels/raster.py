@@ -39,13 +39,15 @@ _DOWN = np.array([s for i in range(4) for s in (-3, -1, 3, 1)], dtype=np.int64)
 class Mesh(NamedTuple):
     """What does not change between frames; vertices and triangles of all items, one after the other.
 
-    triangle : (t, 3)   item : (t,)   start : (n + 1,), incident : (3 t,) triangles of each vertex   uv : (t, 6) corners
+    triangle : (t, 3)   item : (t,)   start : (n + 1,), incident : (3 t,) triangles of each vertex   owner : (n,) item
+    uv : (t, 6) of the corners
     """
 
     triangle: np.ndarray
     item: np.ndarray
     start: np.ndarray
     incident: np.ndarray
+    owner: np.ndarray
     uv: np.ndarray
 
 
@@ -156,10 +158,9 @@ ENCODE_TOP = 2.0
 P_MIP, P_NORMAL, P_SIDE = 9, 10, 13
 W_PIXEL, W_TRIANGLE, W_SAMPLES, N_WHOLE = 0, 1, 2, 3
 
-SAME_DEPTH = 0.006
-"""Samples of one item in one pixel share a colour if their depths differ by less than this part ..."""
-SAME_TURN = 0.8
-"""... and the cosine between their triangles is above this."""
+# Samples of one item in one pixel share a colour if their depths differ by less than a part of 1/1024, or by less than
+# SAME_DEPTH where the cosine between their triangles is above SAME_TURN.
+SAME_DEPTH, SAME_TURN = 0.006, 0.8
 
 # Camera numbers, one array: 9 rows of the rotation, 3 position, focal length [pixel], centre x, centre y, near [mm].
 C_POSITION, C_FOCAL, C_X, C_Y, C_NEAR = 9, 12, 13, 14, 15
@@ -169,11 +170,22 @@ N_CAMERA = 16
 # ---------------------------------------------------------------------------------------------------- vertices
 
 
+@kernel
+def carry(rest, pose, out):
+    """Put points `rest` (n, 3), moved by `pose` (4, 4), into `out`."""
+    for i in range(rest.shape[0]):
+        x, y, z = rest[i, 0], rest[i, 1], rest[i, 2]
+        for r in range(3):
+            out[i, r] = pose[r, 0] * x + pose[r, 1] * y + pose[r, 2] * z + pose[r, 3]
+
+
 @kernel(parallel=True)
-def facet_pass(mesh, points, frame):
-    """Normals of all triangles, scaled by twice their area, in the frame of `points` (n, 3) [mm]."""
-    triangle, facet = mesh.triangle, frame.facet
+def facet_pass(moved, mesh, points, frame):
+    """Normals of the triangles of moved items, scaled by twice their area, in the frame of `points` (n, 3) [mm]."""
+    triangle, item, facet = mesh.triangle, mesh.item, frame.facet
     for t in prange(triangle.shape[0]):
+        if not moved[item[t]]:
+            continue
         a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
         ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
         vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
@@ -194,18 +206,20 @@ def project(camera, x, y, z):
 
 
 @kernel(parallel=True)
-def vertex_pass(mesh, points, camera, frame):
-    """Unit vertex normals and vertices in camera space, and their screen positions; `points` (n, 3) must be finite."""
-    start, incident, facet = mesh.start, mesh.incident, frame.facet
+def vertex_pass(moved, mesh, points, camera, frame):
+    """Normals, places in camera space and on the screen of moved items' vertices; `points` (n, 3) must be finite."""
+    start, incident, owner, facet = mesh.start, mesh.incident, mesh.owner, frame.facet
     eye, screen, vertex = frame.eye, frame.screen, frame.vertex
     for i in prange(points.shape[0]):
+        if not moved[owner[i]]:
+            continue
         nx, ny, nz = 0.0, 0.0, 0.0
         for k in range(start[i], start[i + 1]):
             t = incident[k]
             nx += facet[t, 0]
             ny += facet[t, 1]
             nz += facet[t, 2]
-        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-60))
+        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
         dx = points[i, 0] - camera[C_POSITION]
         dy = points[i, 1] - camera[C_POSITION + 1]
         dz = points[i, 2] - camera[C_POSITION + 2]
@@ -232,7 +246,7 @@ def _clip(camera, eye, screen, a, b, c):
     """Corners (3 or 4) on the screen of a triangle cut by the near plane, in the order of a, b, c."""
     near = camera[C_NEAR]
     ia, ib, ic = eye[a, 2] >= near, eye[b, 2] >= near, eye[c, 2] >= near
-    if ia + ib + ic == 1:
+    if int(ia) + int(ib) + int(ic) == 1:
         while not ia:
             a, b, c = b, c, a
             ia, ib, ic = ib, ic, ia
@@ -297,12 +311,16 @@ def _holds_sample(left, right, top, bottom):
 
 
 @kernel
-def _set_up(first, last, layer, camera, triangle, item, uv, eye, screen, facet, plane, deep, box, material, level):
+def _set_up(
+    first, last, layer, moved, camera, triangle, item, uv, eye, screen, facet, plane, deep, box, material, level
+):
     """`setup_pass` for triangles first..last-1."""
     width, height = int(2.0 * camera[C_X]), int(2.0 * camera[C_Y])
     for t in range(first, last):
-        box[t, 2], box[t, 3] = 1, 0
         m = item[t]
+        if not moved[m]:
+            continue
+        box[t, 2], box[t, 3] = 1, 0
         a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
         if material[m, M_LAYER] != layer:
             continue
@@ -336,7 +354,7 @@ def _set_up(first, last, layer, camera, triangle, item, uv, eye, screen, facet, 
         if _planes(camera, eye, a, b, c, t, plane, deep) == 0.0:
             continue
         nx, ny, nz = facet[t, 0], facet[t, 1], facet[t, 2]
-        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-60))
+        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
         plane[t, P_NORMAL], plane[t, P_NORMAL + 1], plane[t, P_NORMAL + 2] = scale * nx, scale * ny, scale * nz
         plane[t, P_SIDE] = deep[t, 5] = 1.0 if area < 0 else -1.0
         if material[m, M_SOURCE] == 1.0:
@@ -346,8 +364,8 @@ def _set_up(first, last, layer, camera, triangle, item, uv, eye, screen, facet, 
 
 
 @kernel(parallel=True)
-def setup_pass(mesh, camera, layer, frame, paint):
-    """Cull the triangles of one layer; fill plane equations, mip levels and pixel boxes of those that may be seen."""
+def setup_pass(moved, mesh, camera, layer, frame, paint):
+    """Cull the triangles of moved items in one layer; fill planes, mip levels and boxes of those that may be seen."""
     triangle, item, uv, eye, screen, facet = mesh.triangle, mesh.item, mesh.uv, frame.eye, frame.screen, frame.facet
     plane, deep, box, material, level = frame.plane, frame.deep, frame.box, paint.material, paint.level
     chunks = (triangle.shape[0] + CHUNK - 1) // CHUNK
@@ -357,6 +375,7 @@ def setup_pass(mesh, camera, layer, frame, paint):
             k * CHUNK,
             last,
             layer,
+            moved,
             camera,
             triangle,
             item,
@@ -477,38 +496,43 @@ def _triangle(sample):
 
 
 @kernel
+def _alike(si, sj, item, plane):
+    """Whether two samples of a pixel may share one colour."""
+    t, k = _triangle(si), _triangle(sj)
+    near = (abs((si >> 32) - (sj >> 32)) <= SAME_DEPTH * (si >> 32)) & (item[t] == item[k])
+    turn = plane[t, P_NORMAL] * plane[k, P_NORMAL] + plane[t, P_NORMAL + 1] * plane[k, P_NORMAL + 1]
+    return near & (turn + plane[t, P_NORMAL + 2] * plane[k, P_NORMAL + 2] >= SAME_TURN)
+
+
+@kernel
 def _list_row(width, sample, item, plane, whole):
     """List the fragments of one row of samples (w / 4, 16), from left to right; return how many there are."""
     n = 0
     for x in range(width):
         u, q = x >> 2, 4 * (x & 3)
         s0, s1, s2, s3 = sample[u, q], sample[u, q + 1], sample[u, q + 2], sample[u, q + 3]
-        if (((s0 ^ s1) | (s0 ^ s2) | (s0 ^ s3)) & LAST_NAME) == 0:
-            if s0 > 0:
+        if (s0 | s1 | s2 | s3) == 0:
+            continue
+        low, high = min(s0, s1, s2, s3), max(s0, s1, s2, s3)
+        if low > 0 and ((high >> 32) - (low >> 32)) << 10 <= high >> 32:
+            # Nearly always: samples close together on one item. One branch that is easy to foresee costs least.
+            m = item[_triangle(s0)]
+            if (m == item[_triangle(s1)]) & (m == item[_triangle(s2)]) & (m == item[_triangle(s3)]):
                 whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(s0), 4
                 n += 1
-            continue
+                continue
         done = 0
         for i in range(4):
             si = sample[u, q + i]
             if si == 0 or (done >> i) & 1:
                 continue
-            t, count = _triangle(si), 1
+            count = 1
             for j in range(i + 1, 4):
                 sj = sample[u, q + j]
-                if sj == 0 or (done >> j) & 1:
-                    continue
-                k = _triangle(sj)
-                if t != k:
-                    if item[t] != item[k] or abs((si >> 32) - (sj >> 32)) > SAME_DEPTH * (si >> 32):
-                        continue
-                    turn = plane[t, P_NORMAL] * plane[k, P_NORMAL]
-                    turn += plane[t, P_NORMAL + 1] * plane[k, P_NORMAL + 1]
-                    if turn + plane[t, P_NORMAL + 2] * plane[k, P_NORMAL + 2] < SAME_TURN:
-                        continue
-                count += 1
-                done |= 1 << j
-            whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, t, count
+                if sj > 0 and not (done >> j) & 1 and _alike(si, sj, item, plane):
+                    count += 1
+                    done |= 1 << j
+            whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(si), count
             n += 1
     return n
 
@@ -552,17 +576,13 @@ def _list_band(band, width, item, plane, sample, fragment, count):
 
 
 @kernel(parallel=True)
-def coverage_pass(stride, listed, mesh, camera, frame):
-    """Fill `sample` and, if `listed`, the list of fragments.
-
-    `stride`, coprime to the number of bands, deals the bands out evenly to threads.
-    """
+def coverage_pass(order, listed, mesh, camera, frame):
+    """Fill `sample` and, if `listed`, the list of fragments; `order` (bands,) deals the bands out to the threads."""
     triangle, eye, screen, box, deep = mesh.triangle, frame.eye, frame.screen, frame.box, frame.deep
     row_start, row_list, sample = frame.row_start, frame.row_list, frame.sample
     item, plane, fragment, count, width = mesh.item, frame.plane, frame.fragment, frame.count, int(2.0 * camera[C_X])
-    bands = row_start.shape[0] - 1
-    for k in prange(bands):
-        b = (k * stride) % bands
+    for k in prange(order.shape[0]):
+        b = order[k]
         _cover_band(b, triangle, eye, screen, box, deep, row_start, row_list, camera, sample)
         if listed:
             _list_band(b, width, item, plane, sample, fragment, count)

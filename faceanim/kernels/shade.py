@@ -364,14 +364,13 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
 
 
 @kernel(parallel=True)
-def shade_pass(stride, opacity, mesh, camera, frame, paint, shadow, step, number, out):
+def shade_pass(order, opacity, mesh, camera, frame, paint, shadow, step, number, out):
     """Write the picture `out` (h, w, 3) sRGB bytes; bands are dealt out as in `coverage_pass`.
 
     opacity : in [0, 1] blends over what `out` holds, negative draws over the background
     shadow : of the key light, bias 0 = none   step : (taps, 3) of the contact shade
     number : (bands, N_NUMBER, 4 w) work space
     """
-    bands = frame.row_start.shape[0] - 1
-    for k in prange(bands):
-        b = (k * stride) % bands
+    for k in prange(order.shape[0]):
+        b = order[k]
         _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, number[b], out)

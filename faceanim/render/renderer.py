@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import gcd, isfinite
+from math import isfinite
 from typing import Any
 
+import numba
 import numpy as np
 
 from faceanim.ground.arrays import Floats, Ints, floats, ints
@@ -77,7 +78,8 @@ def _joined(items: Sequence[DrawItem], first: Ints) -> raster.Mesh:
         at += len(item.triangles)
     start, incident = _incidence(triangles, int(first[-1]))
     owner = np.repeat(np.arange(len(items), dtype=np.int32), [len(item.triangles) for item in items])
-    return raster.Mesh(np.ascontiguousarray(triangles, dtype=np.int32), owner, start, incident, uv)
+    holder = np.repeat(np.arange(len(items), dtype=np.int32), np.diff(first))
+    return raster.Mesh(np.ascontiguousarray(triangles, dtype=np.int32), owner, start, incident, holder, uv)
 
 
 def _contact_steps() -> Floats:
@@ -91,6 +93,18 @@ def _contact_steps() -> Floats:
     steps = np.array(rows)
     steps[:, 2] /= steps[:, 2].sum()
     return steps
+
+
+def dealt(cost: Any) -> Ints:
+    """Return the bands in an order that gives each thread, which takes its share in one piece, about the same cost.
+
+    cost : (bands,). The order never changes the picture.
+    """
+    threads = numba.get_num_threads()
+    rank = np.argsort(-np.asarray(cost), kind="stable")
+    turn = np.arange(len(rank)) % (2 * threads)
+    owner = np.where(turn < threads, turn, 2 * threads - 1 - turn)
+    return rank[np.argsort(owner, kind="stable")].astype(np.int32)
 
 
 class Renderer:
@@ -126,7 +140,8 @@ class Renderer:
         self._points = np.concatenate([item.points for item in items])
         self._steps = _contact_steps()
         bands = len(self._frame.row_start) - 1
-        self._stride = next(s for s in range(max(int(0.618 * bands), 1), bands + 2) if gcd(s, bands) == 1)
+        self._moved = np.ones(len(items), np.bool_)
+        self._poses: list[Floats | None] = [None] * len(items)
         self._number = np.zeros((bands, shade.N_NUMBER, 4 * width), np.float32)
         casts = np.array([item.material.casts and item.material.layer == 0 for item in items])[self._mesh.item]
         use = self.look.shadow and bool(casts.any())
@@ -148,6 +163,7 @@ class Renderer:
     def camera(self, camera: Camera) -> None:
         self._camera = camera
         self._numbers = camera.numbers(*self.size)
+        self._moved[:] = True
 
     def _slice(self, item: int) -> slice:
         return slice(int(self._first[item]), int(self._first[item + 1]))
@@ -169,18 +185,24 @@ class Renderer:
                 if np.shape(new) != target.shape:
                     raise UserError(f"item {i} has {len(target)} vertices; points of shape {np.shape(new)} were given")
                 target[:] = new
+                self._moved[i], self._poses[i] = True, None
             elif item.bone is not None and bone_pose is not None:
-                pose = bone_pose[item.bone]
-                np.matmul(item.points, pose[:3, :3].T, out=target)
-                target += pose[:3, 3]
+                pose = np.ascontiguousarray(bone_pose[item.bone], dtype=np.float64)
+                if self._poses[i] is None or not np.array_equal(pose, self._poses[i]):
+                    raster.carry(item.points, pose, target)
+                    self._moved[i], self._poses[i] = True, pose.copy()
 
     def _cover(self, layer: int) -> None:
         """Fill the sample buffers with one layer."""
-        raster.setup_pass(self._mesh, self._numbers, float(layer), self._frame, self._paint)
+        if len(self._layers) > 1:  # what the other layer left in the tables is of no use
+            self._moved[:] = True
+        raster.setup_pass(self._moved, self._mesh, self._numbers, float(layer), self._frame, self._paint)
+        self._moved[:] = False
         if raster.band_pass(self._frame) > len(self._frame.row_list):
             self._frame = raster.longer_list(self._frame)
             raster.band_pass(self._frame)
-        raster.coverage_pass(self._stride, True, self._mesh, self._numbers, self._frame)
+        order = dealt(np.diff(self._frame.row_start))
+        raster.coverage_pass(order, True, self._mesh, self._numbers, self._frame)
 
     def _prepare(self) -> None:
         """Normals and projection of all vertices."""
@@ -188,8 +210,8 @@ class Renderer:
             bad = int(np.argmax(~np.isfinite(self._points).all(axis=1)))
             item = int(np.searchsorted(self._first, bad, side="right")) - 1
             raise RunError(f"vertex {bad - self._first[item]} of item {item} has a position that is not finite")
-        raster.facet_pass(self._mesh, self._points, self._frame)
-        raster.vertex_pass(self._mesh, self._points, self._numbers, self._frame)
+        raster.facet_pass(self._moved, self._mesh, self._points, self._frame)
+        raster.vertex_pass(self._moved, self._mesh, self._points, self._numbers, self._frame)
 
     def depth(self) -> Floats:
         """Return the depth [mm] of the four samples of each pixel as last placed, (h, w, 4), inf where nothing is."""
@@ -217,5 +239,6 @@ class Renderer:
             self._cover(layer)
             opacity = -1.0 if layer == self._layers[0] else self.layer_opacity
             tail = (self._frame, self._paint, self._shadow, self._steps, self._number, self._out)
-            shade.shade_pass(self._stride, opacity, self._mesh, self._numbers, *tail)
+            order = dealt(np.add.reduceat(self._frame.count, np.arange(0, self.size[1], raster.BAND)))
+            shade.shade_pass(order, opacity, self._mesh, self._numbers, *tail)
         return self._out

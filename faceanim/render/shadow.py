@@ -35,6 +35,8 @@ class ShadowMap:
         material[:, raster.M_SIDED] = 0.0  # back sides lie behind fronts
         self._paint = paint._replace(material=material)
         self._frame = raster.buffers(len(points), len(self._mesh.triangle), SIZE, SIZE)
+        self._moved = np.ones(len(paint.material), np.bool_)
+        self._order = np.arange(len(self._frame.row_start) - 1, dtype=np.int32)[::-1].copy()
         used = points[np.unique(self._mesh.triangle)]
         self._centre = 0.5 * (used.min(axis=0) + used.max(axis=0))
         self._radius = 7.0 / 6.0 * float(np.linalg.norm(used - self._centre, axis=1).max())
@@ -51,11 +53,11 @@ class ShadowMap:
         number = eye.numbers(SIZE, SIZE)
         frame, mesh = self._frame, self._mesh
         shadow.light_view_pass(points, number, frame.eye, frame.screen)
-        raster.setup_pass(mesh, number, 0.0, frame, self._paint)
+        raster.setup_pass(self._moved, mesh, number, 0.0, frame, self._paint)
         if raster.band_pass(frame) > len(frame.row_list):
             frame = self._frame = raster.longer_list(frame)
             raster.band_pass(frame)
-        raster.coverage_pass(1, False, mesh, number, frame)
+        raster.coverage_pass(self._order, False, mesh, number, frame)
         far = 2.0 * self._radius
         shadow.moment_pass(number, distance, far, REACH, frame.sample, self._moment, self._spare)
         to_light = np.zeros(16, np.float32)

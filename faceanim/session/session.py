@@ -76,7 +76,7 @@ class Session:
         duration: float | None = None,
         backend: str = "mass_spring",
         options: Any = None,
-        largest_step: float = 1.0 / 60.0,
+        largest_step: float = 1.0 / 30.0,
         body: Body | None = None,
     ) -> None:
         self.face, self.expression = face, expression

@@ -7,7 +7,6 @@ import pytest
 from toys import patch, toy_body
 
 from faceanim.bench.metrics import (
-    closest_on_triangles,
     crossing_depth,
     field_error,
     inverted_triangles,
@@ -29,19 +28,6 @@ def test_field_error_is_max_and_rms() -> None:
     assert (error.max, error.rms) == (5.0, 2.5)
 
 
-def test_the_closest_point_beats_every_sample() -> None:
-    """No sample of the triangle is closer than the closest point, which lies in the triangle."""
-    rng = np.random.default_rng(3)
-    x, a, b, c = rng.normal(size=(4, 200, 3))
-    bary = closest_on_triangles(x, a, b, c)
-    assert bary.min() >= -1e-12
-    assert np.allclose(bary.sum(axis=1), 1.0)
-    foot = np.einsum("ek,kej->ej", bary, np.stack([a, b, c]))
-    samples = rng.dirichlet([0.5, 0.5, 0.5], size=400)
-    other = np.einsum("sk,kej->sej", samples, np.stack([a, b, c]))
-    assert (np.linalg.norm(x - foot, axis=1) <= np.linalg.norm(x - other, axis=2).min(axis=0) + 1e-12).all()
-
-
 def test_a_vertex_pulled_over_its_neighbours_turns_triangles() -> None:
     """A sheet at rest, moved or bent has none turned; a vertex dragged across three columns turns some."""
     mesh = patch()
@@ -55,25 +41,35 @@ def test_a_vertex_pulled_over_its_neighbours_turns_triangles() -> None:
 
 
 def _two_sheets(gap: float) -> tuple[TriMesh, PairContact]:
-    """A lower sheet that looks up and, `gap` above it, one vertex of an upper sheet."""
-    lower = sheet(8, 8, 16.0, 16.0)
-    points = np.concatenate([lower.points, [[0.3, 0.2, gap], [1.3, 0.2, gap], [0.3, 1.2, gap]]])
-    n = len(lower.points)
-    mesh = TriMesh(points, np.concatenate([lower.triangles, [[n, n + 2, n + 1]]]))
-    everything = np.arange(len(lower.triangles), dtype=np.int32)
-    pair = PairContact("lips", np.array([n], np.int32), np.array([0, len(everything)], np.int32), everything, 0.1)
+    """A sheet in the plane z = 0 and, `gap` above it, a smaller one that is tilted."""
+    lower, upper = sheet(8, 8, 16.0, 16.0), sheet(4, 4, 6.0, 6.0)
+    raised = upper.points + np.array([0.31, 0.17, gap])
+    raised[:, 2] += 0.1 * raised[:, 0]
+    mesh = TriMesh(np.concatenate([lower.points, raised]), np.concatenate([lower.triangles, upper.triangles + 81]))
+    everything = np.arange(len(mesh.triangles), dtype=np.int32)
+    pair = PairContact("lips", np.array([81], np.int32), np.array([0, len(everything)], np.int32), everything, 0.1)
     return mesh, pair
 
 
-def test_crossing_is_measured_to_its_depth() -> None:
-    """Apart is no crossing; pushed 1.5 mm through is 1.5 mm, less what was crossed at rest."""
+def test_crossing_is_found_and_measured() -> None:
+    """Apart, or bent together, is no crossing; a tilted sheet pushed half through crosses by part of an edge."""
     mesh, pair = _two_sheets(1.0)
     assert crossing_depth(mesh, pair, mesh.points) == 0.0
+    bent = mesh.points.copy()
+    bent[:, 2] += 0.02 * bent[:, 0] ** 2
+    assert crossing_depth(mesh, pair, bent) == 0.0
     pushed = mesh.points.copy()
-    pushed[-3:, 2] = -1.5
-    assert crossing_depth(mesh, pair, pushed) == pytest.approx(1.5)
-    mesh, pair = _two_sheets(-0.5)
-    assert crossing_depth(mesh, pair, pushed) == pytest.approx(1.0)
+    pushed[81:, 2] -= 1.0
+    assert 0.0 < crossing_depth(mesh, pair, pushed) < 0.3
+    folded = mesh.points.copy()
+    folded[81 + 12, 2] -= 2.0
+    assert crossing_depth(mesh, pair, folded) == pytest.approx(1.0 - 0.031 - 0.069, abs=0.1)
+
+
+def test_what_crosses_at_rest_does_not_count() -> None:
+    """A mesh that is built with a crossing is not blamed for it."""
+    mesh, pair = _two_sheets(0.0)
+    assert crossing_depth(mesh, pair, mesh.points) == 0.0
 
 
 def test_a_body_at_rest_is_sound() -> None:

@@ -154,3 +154,18 @@ def test_progress_is_on_standard_error_only(capsys: pytest.CaptureFixture[str]) 
     out, err = capsys.readouterr()
     assert err == ""
     assert out.count("\n") == 1
+
+
+def test_unsound_skin_is_put_into_words() -> None:
+    """What is wrong is named; what lies within the play of contact is not."""
+    from faceanim.bench.metrics import Soundness
+    from faceanim.cli.production import faults
+
+    assert faults(Soundness(0, 0.05, 0.0, {"lips": 0.02})) == []
+    words = faults(Soundness(3, 0.5, 0.2, {"lips": 1.25, "lids_left": 0.0}))
+    assert words == [
+        "3 triangles are turned over",
+        "skin lies 0.5 mm inside bone",
+        "skin lies 0.2 mm inside an eyeball",
+        "lips cross by 1.2 mm",
+    ]

@@ -23,9 +23,9 @@ QUICK = ["--density", "coarse", "--size", "96", "--fps", "20", "--duration", "0.
 
 @pytest.fixture(scope="module")
 def smile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of a short smile, measured along the whole way."""
+    """Results of a short smile."""
     folder = tmp_path_factory.mktemp("smile") / "frames"
-    words = ["--save-points", "--threads", "1", "--check", "trajectory"]
+    words = ["--save-points", "--threads", "1"]
     assert main(["express", "happiness", *QUICK, *words, "--out", str(folder)]) == 0
     return folder
 
@@ -45,7 +45,6 @@ def test_the_record_shows_an_accurate_and_sound_run(smile: Path) -> None:
     record = json.loads((smile / "run.json").read_text())
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
     assert record["accuracy_mm"]["rest"]["max"] < 0.1
-    assert record["accuracy_mm"]["trajectory"]["rms"] < 0.02 * record["accuracy_mm"]["largest_movement"]
     skin = record["skin_worst_frame_mm"]
     assert skin["inverted_triangles"] == 0
     assert max(skin["depth_in_bone"], skin["depth_in_eyeball"], *skin["depth_crossed"].values()) < 0.1
@@ -97,6 +96,14 @@ def test_every_expression_is_sound_in_every_frame(name: str, tmp_path: Path) -> 
     assert max(skin["depth_in_bone"], skin["depth_in_eyeball"], *skin["depth_crossed"].values()) < 0.1
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
     assert record["accuracy_mm"]["rest"]["max"] < 0.1
+
+
+@pytest.mark.slow
+def test_the_way_is_right_too(tmp_path: Path) -> None:
+    """The smile follows the converged trajectory within 2 % of its movement (RMS over vertices, worst frame)."""
+    assert main(["express", "happiness", *QUICK, "--check", "trajectory", "--out", str(tmp_path)]) == 0
+    accuracy = json.loads((tmp_path / "run.json").read_text())["accuracy_mm"]
+    assert accuracy["trajectory"]["rms"] < 0.02 * accuracy["largest_movement"]
 
 
 @pytest.mark.slow

@@ -39,8 +39,10 @@ class Patch:
     muscles: int
 
 
-FACING = 0.3
+FACING = -0.2
 """Cosine of the angle between the normals of a vertex and a triangle above which they cannot meet."""
+RINGS = 3
+"""A vertex does not meet triangles within so many edges of it: there the two sides are one sheet."""
 
 BEHIND = 0.3
 """A vertex is behind a triangle at rest if this share of its distance, or more, is behind the triangle's plane."""
@@ -114,11 +116,12 @@ class Tables:
             if one.grid is not None and mine.any():
                 clear[mine] = np.minimum(clear[mine], one.grid.sample(x[node[mine]]))
         ball_node, ball, ball_clear = _sphere_pairs(body)
+        hard = np.repeat([s.hardness for s in body.spheres], [len(s.node) for s in body.spheres])
         gap = np.linalg.norm(x[ball_node] - ball[:, :3], axis=1) - ball[:, 3]
         ball = np.concatenate([ball[:, :3], (ball[:, 3] + np.minimum(ball_clear, gap))[:, None]], axis=1)
         pair_node, pair_start, pair_triangle, pair_gap = _pair_lists(body)
         self.colliders = Colliders(
-            node, bone, clear, area[node], ball_node, np.ascontiguousarray(ball), area[ball_node],
+            node, bone, clear, area[node], ball_node, np.ascontiguousarray(ball), area[ball_node] * hard,
             pair_node, pair_start, pair_triangle, pair_gap, area[pair_node],
             self.triangles, float(body.contact_stiffness), STIFFENING,
         )  # fmt: skip
@@ -258,7 +261,7 @@ def _sphere_pairs(body: Body) -> tuple[Ints, Floats, Floats]:
 def _pair_lists(body: Body) -> tuple[Ints, Ints, Ints, Floats]:
     """Return node, start, triangle and gap of every pair contact.
 
-    Left out is what a vertex cannot meet: triangles that hold it or a neighbour, that look the same way as it does, or
+    Left out is what a vertex cannot meet: triangles around it, that look the same way as it does, or
     that it is behind at rest (as at the corners of mouth and eyes, where the two sides are one sheet).
     """
     node: list[int] = []
@@ -267,12 +270,12 @@ def _pair_lists(body: Body) -> tuple[Ints, Ints, Ints, Floats]:
     points, corners = body.surface.points, body.surface.triangles
     looks = body.surface.vertex_normals
     faces = body.surface.normals_by_area / np.maximum(body.surface.areas[:, None], 1e-300)
-    near = topology.neighbours(corners, len(points))
+    adjacent = topology.neighbours(corners, len(points))
     for pair in body.pairs:
         for c, i in enumerate(pair.node):
             mine = pair.triangle[pair.start[c] : pair.start[c + 1]]
             mine = mine[faces[mine] @ looks[i] < FACING]
-            mine = mine[~np.isin(corners[mine], np.append(near.of(int(i)), i)).any(axis=1)].astype(np.int32)
+            mine = mine[~np.isin(corners[mine], _around(adjacent, int(i))).any(axis=1)].astype(np.int32)
             keep = np.zeros(len(mine), dtype=bool)
             contact.in_front(points, corners, int(i), mine, BEHIND, TOUCHING, keep)
             if keep.any():
@@ -286,6 +289,14 @@ def _pair_lists(body: Body) -> tuple[Ints, Ints, Ints, Floats]:
         np.concatenate(triangle).astype(np.int32),
         np.array(gap, dtype=np.float64),
     )
+
+
+def _around(adjacent: topology.Lists, i: int) -> Ints:
+    """Return the vertices within `RINGS` edges of vertex `i`, with itself."""
+    found = np.array([i], dtype=np.int32)
+    for _ in range(RINGS):
+        found = np.unique(np.concatenate([found, *(adjacent.of(int(j)) for j in found)]))
+    return found
 
 
 def _local_fibres(body: Body, local: Ints, m: int, n: int) -> Fibres:

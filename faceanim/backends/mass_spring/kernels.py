@@ -13,7 +13,7 @@ import numpy as np
 
 from faceanim.ground.jit import kernel
 from faceanim.kernels.attachment import carry, find_shift, growth, tether_force, tie
-from faceanim.kernels.contact import find, plane_force, plane_gap
+from faceanim.kernels.contact import find, penalty, plane_force, plane_gap
 from faceanim.kernels.muscles import aim, fibre_force, pull_of
 from faceanim.kernels.springs import elastic_force
 from faceanim.kernels.tangent import height_terms
@@ -95,12 +95,15 @@ def finish(x, q, q_before, nodes, m, gamma, now, before, q_out, qd_out):
 
 
 @kernel
-def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, sweeps, tolerance, force, move):
+def accelerated_sweeps(
+    x, scene, moment, scratch, weight, centre, low, high, sweeps, tolerance, reach, pair_reach, force, move
+):
     """Jacobi sweeps with Chebyshev acceleration on w (x - c) = F(x), in place.
 
     Each sweep divides every vertex's residual by w + k, with the k of the moment: stiffening and new contacts count
     at once. [low, high] : the eigenvalues to damp, of the matrix so scaled (at most 2)
     force : (n, 4), move : (n, 3) work   tolerance : stop when no vertex wants to go farther [mm]
+    reach, pair_reach : of the contacts; when vertices may have used up half of it, contacts are found anew
     Returns (sweeps made, largest residual [mN], largest wish [mm]) of the last sweep, before it moved.
     """
     middle = 0.5 * (high + low)
@@ -109,6 +112,7 @@ def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, swe
     residual = 0.0
     wish = 0.0
     best = np.inf
+    travel = 0.0
     find_shift(x, moment.anchor, moment.shift)
     move[:] = 0.0
     for sweep in range(sweeps):
@@ -127,11 +131,18 @@ def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, swe
             rho = 0.0
             residual, wish = sweep_moves(x, scene, moment, weight, centre, force, 0.0, 1.0 / middle, move)
         best = min(best, wish)
+        farthest = 0.0
         for i in range(scene.free):
+            farthest = max(farthest, move[i, 0] ** 2 + move[i, 1] ** 2 + move[i, 2] ** 2)
             for d in range(3):
                 x[i, d] += move[i, d]
                 moment.shift[i, d] += move[i, d]
-        if wish < tolerance * tolerance:
+        travel += math.sqrt(farthest)
+        if travel > 0.5 * pair_reach:
+            find(x, scene.colliders, scene.grids, moment.pose, reach, pair_reach, moment.planes)
+            travel = 0.0
+        # A single sweep must not count as a solution unless nothing moves at all: its small errors would add up.
+        if wish < tolerance * tolerance and (sweep >= 3 or wish < 1e-8 * tolerance * tolerance):
             return sweep + 1, math.sqrt(residual), math.sqrt(wish)
     return sweeps, math.sqrt(residual), math.sqrt(wish)
 
@@ -313,13 +324,13 @@ def chained_contacts(i, x, planes, stiffening, head, link):
         slot = at - 4 * c
         p = -plane_gap(x, planes, c)
         if p > 0.0:
-            q = (p / stiffening) ** 2
+            _, f, kt = penalty(p, stiffening)
             w = 1.0 if slot == 0 else -planes.weight[c, slot - 1]
-            f = w * planes.stiffness[c] * p * (1.0 + q)
+            f *= w * planes.stiffness[c]
             fx += f * planes.normal[c, 0]
             fy += f * planes.normal[c, 1]
             fz += f * planes.normal[c, 2]
-            k += abs(w) * planes.stiffness[c] * (1.0 + 3.0 * q) * (1.0 if planes.node[c, 1] < 0 else 2.0)
+            k += abs(w) * planes.stiffness[c] * kt
         at = link[at]
     return fx, fy, fz, k
 
@@ -400,22 +411,30 @@ def semi_implicit_step(x, v, scene, moment, scratch, mass, drag, h, force):
 
 
 @kernel
-def substeps_needed(x, scene, moment, scratch, mass, drag, h, safety, force):
-    """Return into how many equal substeps leapfrog must divide `h` at the present stiffness.
+def largest_substep(scene, mass, drag, h, safety, force):
+    """Return the largest stable leapfrog step up to `h` at the stiffness that `force` (n, 4) holds.
 
-    With drag D integrated exactly, a mode of stiffness lambda is stable if h tanh(D h / 2) lambda < 2 D m; lambda is
+    With drag D integrated exactly, a mode of stiffness lambda is stable if s tanh(D s / 2) lambda < 2 D m; lambda is
     at most 2 k.
     """
-    total_force(x, scene, moment, scratch, force)
-    worst = 0.0
+    worst = 1e-300
     for i in range(scene.free):
         worst = max(worst, 2.0 * force[i, 3] / mass[i])
-    for n in range(1, 1000000):
-        s = h / n
+    high = h
+    low = 0.0
+    for _ in range(40):
+        s = high if low == 0.0 and high == h else 0.5 * (low + high)
         damping = math.tanh(0.5 * drag * s) / drag if drag > 0.0 else 0.5 * s
         if s * damping * worst < 2.0 * safety:
-            return n
-    return 1000000
+            if s == h:
+                return h
+            low = s
+        else:
+            if s == h and low == 0.0:
+                high = 0.999999 * h
+            else:
+                high = s
+    return low
 
 
 @kernel
@@ -435,22 +454,26 @@ def at_share(start, end, share, work, scene, moment):
 
 
 @kernel
-def leapfrog(x, v, held, start, end, work, scene, moment, scratch, mass, drag, h, substeps, reach, force):
-    """Kick - drift - kick with exact drag, `substeps` times h / substeps; `force` must hold the forces at `x`.
+def leapfrog(x, v, held, start, end, work, scene, moment, scratch, mass, drag, h, safety, most, reach, force):
+    """Kick - drift - kick with exact drag over `h`, in substeps as small as the stiffness of the moment asks for.
 
     start, end, work : `Drive`s at both ends of the step, between which bones and muscles go evenly
-    held : (n,) vertices that go with the bones. Returns the largest force [mN].
+    held : (n,) vertices that go with the bones. Returns (substeps, largest force [mN]).
     """
-    s = h / substeps
-    decay = math.exp(-0.5 * drag * s)
-    gain = (1.0 - decay) / drag if drag > 0.0 else 0.5 * s
+    total_force(x, scene, moment, scratch, force)
+    done = 0.0
     worst = 0.0
-    for n in range(substeps):
+    for n in range(most):
+        s = largest_substep(scene, mass, drag, h, safety, force)
+        s = (h - done) / math.ceil((h - done) / s * (1.0 - 1e-9))
+        decay = math.exp(-0.5 * drag * s)
+        gain = (1.0 - decay) / drag if drag > 0.0 else 0.5 * s
         for i in range(scene.free):
             for d in range(3):
                 v[i, d] = decay * v[i, d] + gain * force[i, d] / mass[i]
                 x[i, d] += s * v[i, d]
-        at_share(start, end, (n + 1.0) / substeps, work, scene, moment)
+        done += s
+        at_share(start, end, done / h, work, scene, moment)
         for i in range(scene.free, len(x)):
             if held[i]:
                 for d in range(3):
@@ -463,4 +486,7 @@ def leapfrog(x, v, held, start, end, work, scene, moment, scratch, mass, drag, h
             worst = max(worst, force[i, 0] ** 2 + force[i, 1] ** 2 + force[i, 2] ** 2)
             for d in range(3):
                 v[i, d] = decay * v[i, d] + gain * force[i, d] / mass[i]
-    return math.sqrt(worst)
+        if done >= h * (1.0 - 1e-9) or not worst < 1e300:
+            return n + 1, math.sqrt(worst)
+    x[:] = np.nan
+    return most, math.sqrt(worst)

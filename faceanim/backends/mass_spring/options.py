@@ -19,7 +19,7 @@ class Options:
         "newton" the same steps solved to the end, the yardstick; "explicit" leapfrog with automatic substeps;
         "semi_implicit" and "paper" the per-node implicit steps of Zhang, Prakash & Sung (Eqs. 18-19), corrected and
         as printed: relaxers rather than integrators, see the stability atlas
-    integrator : "bdf2" (second order) or "euler", for block_descent and newton
+    integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), for block_descent and newton
     sweeps : passes of block_descent over the vertices in a step
     adaptive : integrate only near the muscles that act and relax the rest quasi-statically (section 4 of the paper)
     tolerance : what the adaptive partition may cost in accuracy [mm]
@@ -34,13 +34,13 @@ class Options:
     """
 
     scheme: str = "block_descent"
-    integrator: str = "bdf2"
-    sweeps: int = 12
+    integrator: str = "euler"
+    sweeps: int = 20
     adaptive: bool = False
     tolerance: float = 0.05
     quasi_static: str = "integrated"
     passes: int = 4
-    sweep_tolerance: float = 1e-4
+    sweep_tolerance: float = 3e-5
     secant: bool = True
     safety: float = 0.8
     newton_tolerance: float = 1e-4

@@ -16,7 +16,7 @@ from faceanim.kernels.tables import Drive
 
 REACH = 1.5
 """Contacts within this distance [mm] of their clearance are watched during a step."""
-PAIR_REACH = 0.6
+PAIR_REACH = 0.3
 """The same for lips and lids, whose search is the dearest."""
 HIGHEST = 2.0
 """No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
@@ -26,6 +26,8 @@ RESOLVED = 1.5
 """n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
 SETTLED = 0.02
 """A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
+MOST_SUBSTEPS = 100_000
+"""Leapfrog gives up (as diverged) when a step asks for more."""
 OMEGA = 1.5
 """Relaxation factor of the passes in wave order."""
 
@@ -119,7 +121,7 @@ class BlockDescent(_Implicit):
             self._gamma, self._low = gamma, self.spectrum.low(self.weight, options.sweeps)
         sweeps, residual, wish = kernels.accelerated_sweeps(
             load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self._low, self.spectrum.high,
-            options.sweeps, options.sweep_tolerance, load.force, self.move,
+            options.sweeps, options.sweep_tolerance, REACH, PAIR_REACH, load.force, self.move,
         )  # fmt: skip
         report.iterations += sweeps
         report.residual = max(report.residual, residual)
@@ -152,7 +154,7 @@ class QuasiStatic(_Patchwise):
             kernels.accelerated_sweeps(
                 x, scene, load.moment, load.scratch, self.weight, self.centre, self.low, self.spectrum.high,
                 options.passes,
-                options.sweep_tolerance, load.force, self.move,
+                options.sweep_tolerance, REACH, PAIR_REACH, load.force, self.move,
             )  # fmt: skip
         else:
             kernels.contact_chains(load.moment.planes, self.head, self.link)
@@ -243,12 +245,9 @@ class Explicit(_Patchwise):
             self._stand(self.end)
         kernels.at_share(self.start, self.end, 0.0, self.work, patch.scene, load.moment)
         load.touch(load.x, REACH, PAIR_REACH)
-        substeps = kernels.substeps_needed(
-            load.x, patch.scene, load.moment, load.scratch, patch.mass, self.drag, h, self.options.safety, load.force
-        )
-        residual = kernels.leapfrog(
+        substeps, residual = kernels.leapfrog(
             load.x, self.v, patch.held, self.start, self.end, self.work, patch.scene, load.moment, load.scratch,
-            patch.mass, self.drag, h, substeps, REACH, load.force,
+            patch.mass, self.drag, h, self.options.safety, MOST_SUBSTEPS, REACH, load.force,
         )  # fmt: skip
         self._stand(self.end)
         self.reached = motion.t + h
@@ -265,10 +264,10 @@ class Explicit(_Patchwise):
         load, patch = self.load, self.load.patch
         load.x[:] = patch.scene.tethers.rest
         load.touch(load.x, 0.0)
-        pieces = kernels.substeps_needed(
-            load.x, patch.scene, load.moment, load.scratch, patch.mass, self.drag, 1.0, self.options.safety, load.force
+        force = load.forces(load.x)
+        return float(
+            kernels.largest_substep(patch.scene, patch.mass, self.drag, 1.0, self.options.safety, force)
         )
-        return 1.0 / float(pieces)
 
 
 SCHEMES: dict[str, type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | type[Paper] | type[Explicit]] = {

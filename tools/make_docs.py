@@ -1,0 +1,158 @@
+"""Make the pictures and tables that README.md shows, with the program itself, and put the tables into README.md.
+
+Run `python tools/make_docs.py` in the repository after the constants or the face have changed (a few minutes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from faceanim import Session, load_expression, load_face
+from faceanim.backends import backend_class
+from faceanim.bench.accuracy import apex_frame
+from faceanim.bench.faithfulness import ARTIST_UNITS, artist_fields, match_field
+from faceanim.bench.metrics import movements
+from faceanim.cli.drawing import Drawing, Picture
+from faceanim.cli.main import main as faceanim
+from faceanim.render.sequence import contact_sheet, write_png
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+EXPRESSIONS = ("neutral", "happiness", "sadness", "surprise", "fear", "anger", "disgust", "contempt")
+UNITS = tuple("1 2 4 5 6 7 9 10 12 14 15 16 17 18 20 22 24 27 45 L46".split())
+SIZE = 420
+CROP = slice(58, 408), slice(70, 350)
+"""The face in a picture of SIZE pixels: rows and columns."""
+
+WANTED = (
+    ("12", "mouth_corner_left_mm", "mouth corner, smile (AU 12) [mm]", "11 to 16"),
+    ("12", "mouth_width_change_percent", "mouth width, smile (AU 12) [%]", "+20 to +35"),
+    ("1+2", "brow_largest_mm", "brow raise (AU 1+2), largest [mm]", "5 to 10"),
+    ("4", "brow_largest_mm", "brow lower (AU 4), largest [mm]", "5 to 8"),
+    ("15", "mouth_corner_left_mm", "mouth corner, frown (AU 15) [mm]", "4 to 7"),
+    ("9", "largest_movement_mm", "nose wrinkle (AU 9), largest [mm]", "6 to 10"),
+    ("45", "lid_aperture_left_mm", "lid aperture, blink (AU 45) [mm]", "below 1.5"),
+    ("27", "incisor_opening_mm", "between the incisors, jaw (AU 27) [mm]", "40 to 47"),
+    ("18", "mouth_width_change_percent", "mouth width, pucker (AU 18) [%]", "-25 to -45"),
+    ("22", "mouth_width_change_percent", "mouth width, funnel (AU 22) [%]", "-25 to -45"),
+)
+"""Formula, measured movement, words, wanted range."""
+
+
+class Apex:
+    """The held apex of expressions on one face, each simulated once."""
+
+    def __init__(self, density: str) -> None:
+        self.face = load_face(density=density)
+        self.body = self.face.body()
+        self._known: dict[str, tuple[Session, np.ndarray]] = {}
+
+    def of(self, name: str) -> tuple[Session, np.ndarray]:
+        """Return a session and its positions (n, 3) [mm] at the end of the apex."""
+        if name not in self._known:
+            options = backend_class("mass_spring").Options(adaptive=True)
+            session = Session(self.face, load_expression(name), body=self.body, options=options)
+            for frame in session.frames(copy=False):
+                if frame.index == apex_frame(session):
+                    self._known[name] = session, frame.points.copy()
+                    break
+        return self._known[name]
+
+    def picture(self, name: str, **options: Any) -> np.ndarray:
+        """Return the picture of an expression at its apex."""
+        session, points = self.of(name)
+        drawing = Drawing(session, Picture(size=(SIZE, SIZE), **options), [points])
+        return drawing.draw(points, 1.0)[CROP].copy()
+
+
+def labelled(pictures: list[np.ndarray], names: list[str], columns: int) -> np.ndarray:
+    """Return pictures in rows of `columns`, each under its name."""
+    rows = [
+        contact_sheet([pictures[k : k + columns]], column_labels=names[k : k + columns])
+        for k in range(0, len(pictures), columns)
+    ]
+    width = max(row.shape[1] for row in rows)
+    padded = [np.pad(row, ((0, 8), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    return np.concatenate(padded)
+
+
+def pictures(apex: Apex) -> None:
+    """Write docs/expressions.png, docs/action_units.png and docs/inside.png."""
+    shown = [apex.picture(name) for name in EXPRESSIONS]
+    write_png(DOCS / "expressions.png", labelled(shown, list(EXPRESSIONS), 4))
+    shown = [apex.picture(name) for name in UNITS]
+    small = [cv2.resize(one, None, fx=0.65, fy=0.65, interpolation=cv2.INTER_AREA) for one in shown]
+    write_png(DOCS / "action_units.png", labelled(small, [f"AU {name}" for name in UNITS], 5))
+    kinds: dict[str, dict[str, Any]] = {
+        "displacement": {"colour": "displacement"},
+        "strain": {"colour": "strain"},
+        "node sets": {"colour": "sets"},
+        "skull": {"show_skull": True, "views": ("three_quarter",)},
+    }
+    shown = [apex.picture("happiness", **options) for options in kinds.values()]
+    write_png(DOCS / "inside.png", labelled(shown, list(kinds), 4))
+
+
+def faithfulness(apex: Apex) -> str:
+    """Return two Markdown tables: movements beside published ranges, and fields beside the artist's."""
+    lines = ["| movement at full activation | measured | wanted |", "|---|---|---|"]
+    brows = np.array([apex.face.landmarks[f"mid_supraorbital_{side}"] for side in ("left", "right")])
+    near = np.linalg.norm(apex.face.mesh.points[:, None] - apex.face.mesh.points[brows], axis=2).min(axis=1) < 30.0
+    for formula, key, words, wanted in WANTED:
+        session, points = apex.of(formula)
+        found = movements(apex.face, points, session.control(1.0))
+        found["brow_largest_mm"] = float(np.linalg.norm(points - apex.face.mesh.points, axis=1)[near].max())
+        lines.append(f"| {words} | {found[key]:.1f} | {wanted} |")
+    lines += [
+        "",
+        "| AU | artist's unit | mean cosine | peak [mm] | artist's peak [mm] | ratio |",
+        "|---|---|---|---|---|---|",
+    ]
+    fields = artist_fields(apex.face.density)
+    for unit, name in ARTIST_UNITS.items():
+        _, points = apex.of(unit)
+        m = match_field(apex.face, unit, name, points - apex.face.mesh.points, fields[name])
+        lines.append(
+            f"| {unit} | {name} | {m.mean_cosine:.2f} | {m.peak:.1f} | {m.artist_peak:.1f} | {m.peak_ratio:.2f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def insert_tables() -> None:
+    """Put docs/framerate.md and docs/faithfulness.md between their marks in README.md."""
+    readme = ROOT / "README.md"
+    text = readme.read_text(encoding="utf-8")
+    for name in ("framerate", "faithfulness"):
+        if not (DOCS / f"{name}.md").exists():
+            continue
+        table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+        marks = f"<!-- table: {name} -->", f"<!-- end of table: {name} -->"
+        pattern = re.escape(marks[0]) + ".*?" + re.escape(marks[1])
+        text = re.sub(pattern, lambda _: f"{marks[0]}\n{table}{marks[1]}", text, flags=re.DOTALL)  # noqa: B023
+    readme.write_text(text, encoding="utf-8")
+
+
+def main() -> None:
+    """Make everything, or what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=("pictures", "framerate", "faithfulness", "insert"))
+    only = parser.parse_args().only
+    DOCS.mkdir(exist_ok=True)
+    apex = Apex("default")
+    if only in (None, "pictures"):
+        pictures(apex)
+    if only in (None, "faithfulness"):
+        (DOCS / "faithfulness.md").write_text(faithfulness(apex), encoding="utf-8")
+    if only in (None, "framerate"):
+        faceanim(["framerate", "--out", str(DOCS)])
+    insert_tables()
+
+
+if __name__ == "__main__":
+    main()
