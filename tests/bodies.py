@@ -29,7 +29,9 @@ NO_MUSCLES = Muscles(
 )  # fmt: skip
 
 
-def ball_grid(centre: tuple[float, float, float], radius: float, half: float = 20.0, spacing: float = 1.0) -> DistanceGrid:
+def ball_grid(
+    centre: tuple[float, float, float], radius: float, half: float = 20.0, spacing: float = 1.0
+) -> DistanceGrid:
     """Return the distance to a ball on a cube of side 2 `half` about it [mm]."""
     axis = np.arange(-half, half + 1e-9, spacing)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
@@ -37,7 +39,9 @@ def ball_grid(centre: tuple[float, float, float], radius: float, half: float = 2
     return DistanceGrid(values.astype(np.float32), np.array(centre) - half, spacing)
 
 
-def zone(points: np.ndarray, at: tuple[float, float], radius: float, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def zone(
+    points: np.ndarray, at: tuple[float, float], radius: float, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices within `radius` of `at` in x and y, and smooth weights that sum to 1."""
     r = np.hypot(points[:, 0] - at[0], points[:, 1] - at[1])
     node = np.flatnonzero((r < radius) & allowed).astype(np.int32)
@@ -122,7 +126,7 @@ def two_lips(gap: float = 0.3) -> Body:
     n = len(upper.points)
     # the upper sheet looks down, the lower one up; shifted so that vertices meet triangles
     turn = np.array([1.0, -1.0, -1.0])
-    points = np.concatenate([upper.points * turn + [0.0, 0.0, 2.0], lower.points + [0.4, 0.3, 0.0]])
+    points = np.concatenate([upper.points * turn + [0.0, 0.0, 2.0], [*lower.points, 0.4, 0.3, 0.0]])
     triangles = np.concatenate([upper.triangles, lower.triangles + n])
     surface = TriMesh(points, triangles)
     t = len(upper.triangles)

@@ -145,7 +145,7 @@ class ToySolver:
             state_out.q[3] = np.nan
         return StepReport(1, 0.0, True, {"dynamic": 1e-5})
 
-    def solve_static(self, control: Control) -> State:
+    def solve_static(self, control: Control, guess: State | None = None) -> State:
         """Return the end of a step."""
         state = self.rest()
         self.step(state, state, control, 1.0)

@@ -68,8 +68,8 @@ class Solver(Protocol):
     def step(self, state_in: State, state_out: State, control: Control, dt: float) -> StepReport:
         """Advance by `dt` [s]; `state_out` may be `state_in`."""
 
-    def solve_static(self, control: Control) -> State:
-        """Return the converged equilibrium under a constant control."""
+    def solve_static(self, control: Control, guess: State | None = None) -> State:
+        """Return the converged equilibrium under a constant control, near `guess` (default: rest) if there are several."""
 
     def surface(self, state: State, out: np.ndarray) -> None:
         """Write the body's surface points (n, 3) [mm] into `out`: the narrow waist."""

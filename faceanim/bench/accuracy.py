@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from faceanim.backends.solver import State
 from faceanim.bench.metrics import FieldError, field_error, worst
 from faceanim.ground.arrays import Floats
 from faceanim.session.session import Session
@@ -21,7 +22,7 @@ class Accuracy:
     """Measured errors [mm] over all vertices.
 
     partition : against the same run with every vertex dynamic, worst frame (None for a full run)
-    rest : the held apex against the converged equilibrium
+    rest : the held apex against the converged equilibrium near it (a skin in contact can have several)
     trajectory : against the converged trajectory (Newton, `FINE_STEPS` times the steps), worst frame
     largest_movement : of the apex [mm], to compare with
     """
@@ -52,13 +53,24 @@ def measure(session: Session, positions: Floats, *, trajectory: bool = False) ->
         result = replace(result, partition=_against(full, positions))
         yield result
     reference = session if full is None else full
-    state = reference.solver.solve_static(session.control(session.timeline.at(frame / session.fps)))
+    state = reference.solver.solve_static(
+        session.control(session.timeline.at(frame / session.fps)), _near(reference, apex)
+    )
     points = np.empty_like(apex)
     reference.solver.surface(state, points)
     result = replace(result, rest=field_error(apex, points))
     yield result
     if trajectory:
         yield replace(result, trajectory=_against(_converged_session(session), positions))
+
+
+def _near(session: Session, points: Floats) -> State | None:
+    """Return a state with the surface at `points`, None if the backend's unknowns are not positions."""
+    state = session.solver.rest()
+    if state.q.shape != points.shape:
+        return None
+    state.q[:] = points
+    return state
 
 
 def _against(reference: Session, positions: Floats) -> FieldError:

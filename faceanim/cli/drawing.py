@@ -83,6 +83,16 @@ class Drawing:
         return self._out
 
 
+def draw_once(face: Face) -> None:
+    """Draw `face` at rest, small, in skin and in numbers, so that everything is compiled."""
+    options = {"bounds": face.mesh.points, "occlusion": vertex_openness(face.mesh.points, face.mesh.triangles)}
+    skin = _scene(face, Picture((64, 64)), "front", mode="skin", texture=Texture.of(face.texture), **options)
+    skin.draw(face.mesh.points, np.tile(np.eye(4), (2, 1, 1)))
+    scale = Scale(0.0, 1.0, "displacement [mm]")
+    seen = _scene(face, Picture((64, 64), show_skull=True), "front", mode="values", scale=scale, **options)
+    seen.draw(face.mesh.points, np.tile(np.eye(4), (2, 1, 1)), np.zeros(len(face.mesh.points)))
+
+
 def _scene(face: Face, picture: Picture, view: str, **options: Any) -> Any:
     bones = []
     if picture.show_skull:

@@ -142,6 +142,7 @@ def run(args: argparse.Namespace) -> int:
     expression_asked(args)
     from faceanim.cli.production import Production
     from faceanim.cli.progress import Progress
+    from faceanim.cli.warmup import drawing_compiled
     from faceanim.ground.jit import cache_notice
     from faceanim.session.recording import Results
 
@@ -153,9 +154,11 @@ def run(args: argparse.Namespace) -> int:
         session = session_asked(args)
         for notice in cache_notice():
             progress.note(notice)
-        with results:
+        with results, drawing_compiled() as finish:
             production = Production(session, picture, results, progress, start)
             production.simulate()
+            progress.stage("preparing to draw")
+            finish()
             production.draw(film=not args.no_video)
             if args.check != "none":
                 production.measure(trajectory=args.check == "trajectory")

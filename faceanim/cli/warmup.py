@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from time import perf_counter
 from typing import Any
+
+from faceanim.ground.errors import unknown_name
+
+PARTS = ("simulation", "drawing")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `faceanim warmup`."""
     parser.add_argument("--quiet", action="store_true", help="no progress, only the closing line")
+    parser.add_argument("--only", metavar="PART", help=f"one of {', '.join(PARTS)} (default: both, side by side)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -18,13 +27,21 @@ def run(args: argparse.Namespace) -> int:
     from faceanim.cli.progress import Progress
     from faceanim.ground.jit import cache_notice
 
+    if args.only is not None and args.only not in PARTS:
+        raise unknown_name("part", args.only, PARTS)
     start = perf_counter()
-    with Progress(quiet=args.quiet) as progress:
-        jobs = _jobs()
-        progress.stage("compiling", len(jobs))
+    with Progress(quiet=args.quiet) as progress, drawing_compiled(wait=args.only is None) as finish:
+        jobs = [] if args.only == "drawing" else _simulation()
+        progress.stage("compiling", len(jobs) + 1)
         for text, job in jobs:
             progress.detail(text)
             job()
+            progress.advance()
+        if args.only != "simulation":
+            progress.detail("drawing")
+            finish()
+            _draw()
+            _mark().touch()
             progress.advance()
         for notice in cache_notice():
             progress.note(notice)
@@ -32,13 +49,40 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _jobs() -> list[tuple[str, Callable[[], Any]]]:
-    """Return what to run, in order, each with a name."""
+def _mark() -> Path:
+    """Return the file that says that drawing has been compiled by these sources and versions."""
+    import numba
+
+    import faceanim.ground.jit  # noqa: F401 (sets the cache folder)
+
+    return Path(str(vars(numba.config)["CACHE_DIR"])) / "drawing.compiled"
+
+
+@contextmanager
+def drawing_compiled(*, wait: bool = True) -> Iterator[Callable[[], Any]]:
+    """Compile what drawing needs in a process beside this one, unless that has been done before.
+
+    Gives a function that waits for it. Should that process fail, this one compiles for itself, only later.
+    """
+    if not wait or _mark().exists():
+        yield lambda: None
+        return
+    command = [sys.executable, "-m", "faceanim.cli.main", "warmup", "--only", "drawing", "--quiet"]
+    helper = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield helper.wait
+    finally:
+        helper.terminate()
+        with suppress(OSError):
+            helper.wait()
+
+
+def _simulation() -> list[tuple[str, Callable[[], Any]]]:
+    """Return what to run for the solvers, in order, each with a name."""
     from dataclasses import replace
     from functools import partial
 
     from faceanim.backends import BACKENDS, backend_class
-    from faceanim.cli.drawing import Picture
     from faceanim.expression.library import load_expression
     from faceanim.face.library import load_face
     from faceanim.session.session import Session
@@ -55,14 +99,11 @@ def _jobs() -> list[tuple[str, Callable[[], Any]]]:
             session = Session(face, expression, backend=name, options=kind, fps=30.0, duration=0.1)
             jobs.append((f"{name} steps", partial(list, session)))
         jobs.append((f"{name} equilibrium", partial(session.solver.solve_static, session.control(0.1))))
-    for colour in ("skin", "displacement"):
-        picture = Picture((64, 64), colour=colour)
-        jobs.append((f"drawing {colour}", partial(_draw, session, picture)))
     return jobs
 
 
-def _draw(session: Any, picture: Any) -> None:
-    from faceanim.cli.drawing import Drawing
+def _draw() -> None:
+    from faceanim.cli.drawing import draw_once
+    from faceanim.face.library import load_face
 
-    points = session.body.surface.points
-    Drawing(session, picture, [points]).draw(points)
+    draw_once(load_face(density="coarse"))

@@ -81,7 +81,9 @@ def bone_contact(
     )
 
 
-def eyeball_contact(points: Floats, name: str, centre: Floats, radius: float, clearance: float, hardness: float) -> SphereContact:
+def eyeball_contact(
+    points: Floats, name: str, centre: Floats, radius: float, clearance: float, hardness: float
+) -> SphereContact:
     """Return the contact of all skin within 5 mm of an eyeball with it."""
     gap = np.linalg.norm(points - centre, axis=1) - radius
     node = np.flatnonzero(gap < 5.0).astype(np.int32)

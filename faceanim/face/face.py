@@ -10,7 +10,7 @@ import numpy as np
 
 from faceanim.body.body import Attachment, Body, Bone, Muscles
 from faceanim.face import attach
-from faceanim.face.attach import LIP, LID, MUCOSA, NECK, SCALP, SKIN
+from faceanim.face.attach import LID, LIP, MUCOSA, NECK, SCALP, SKIN
 from faceanim.face.geodesic import distance_along
 from faceanim.face.library import asset_arrays, asset_folder, asset_text
 from faceanim.face.muscles import AnyMuscle, Lids, Terrain, build_muscles, parse_muscles
@@ -133,9 +133,7 @@ class Face:
     @cached_property
     def mouth_side(self) -> Ints:
         """+1 where the upper lip is nearer along the skin than the lower lip, else -1, (n,)."""
-        return attach.mouth_side(
-            self.mesh, self.region, self.contact_sets["lip_upper"], self.contact_sets["lip_lower"]
-        )
+        return attach.mouth_side(self.mesh, self.region, self.contact_sets["lip_upper"], self.contact_sets["lip_lower"])
 
     @cached_property
     def pinned(self) -> Bools:
@@ -230,7 +228,9 @@ class Face:
             bones=(Bone("cranium", self.skull.cranium_grid), Bone("jaw", self.skull.jaw_grid)),
             bone_contact=self._bone_contact(),
             spheres=tuple(
-                attach.eyeball_contact(mesh.points, f"eye_{s}", e.centre, e.radius, contact.eye_clearance, contact.eye_hardness)
+                attach.eyeball_contact(
+                    mesh.points, f"eye_{s}", e.centre, e.radius, contact.eye_clearance, contact.eye_hardness
+                )
                 for s, e in self.eyes.items()
             ),
             pairs=tuple(self._pairs()),

@@ -169,7 +169,9 @@ def _on_side(terrain: Terrain, side: Side) -> Floats:
     return np.where(terrain.side == (1 if side == "upper" else -1), terrain.area, 0.0)
 
 
-def _zone(name: str, raw: Floats, point: Floats, *, kind: int = PULL_TO_POINT, softening: float, bone: int = 0) -> _Zone:
+def _zone(
+    name: str, raw: Floats, point: Floats, *, kind: int = PULL_TO_POINT, softening: float, bone: int = 0
+) -> _Zone:
     node = np.flatnonzero(raw > 1e-9 * max(float(raw.max(initial=0.0)), 1e-300)).astype(np.int32)
     if not len(node):
         raise AssetError(f"muscle {name!r} reaches no skin vertex; move its insertion or widen its zone")

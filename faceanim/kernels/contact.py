@@ -55,8 +55,14 @@ def sample_grid(grids, b, x, y, z):
     c1 = c10 + v * (c11 - c10)
     along_w = (1 - u) * ((1 - v) * (c001 - c000) + v * (c011 - c010))
     along_w += u * ((1 - v) * (c101 - c100) + v * (c111 - c110))
+    along_u = c1 - c0
+    if u < 1e-9 and i > 0:
+        # On a layer of samples the two sides have a say, or the midline of a symmetric head would be pushed sideways.
+        d0 = float(g[at - up]) * (1 - w) + float(g[at - up + 1]) * w
+        d1 = float(g[at - up + nz]) * (1 - w) + float(g[at - up + nz + 1]) * w
+        along_u = 0.5 * (c1 - (1 - v) * d0 - v * d1)
     along_v = (1 - u) * (c01 - c00) + u * (c11 - c10)
-    return c0 + u * (c1 - c0), (c1 - c0) / h, along_v / h, along_w / h
+    return c0 + u * (c1 - c0), along_u / h, along_v / h, along_w / h
 
 
 @kernel
@@ -411,10 +417,12 @@ def plane_force(x, planes, stiffening, force):
             _, f, k = penalty(p, stiffening)
             spread(planes, c, planes.stiffness[c] * f, force)
             k *= planes.stiffness[c]
-            force[planes.node[c, 0], 3] += k
             if planes.node[c, 1] >= 0:
+                # (sum w z)^2 <= 2 sum |w| z^2: so bounded, contact never has the largest eigenvalue of a sweep
+                k *= 2.0
                 for j in range(3):
                     force[planes.node[c, j + 1], 3] += k * planes.weight[c, j]
+            force[planes.node[c, 0], 3] += k
 
 
 @kernel

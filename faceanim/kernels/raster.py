@@ -19,7 +19,7 @@ import numpy as np
 from faceanim.ground.jit import kernel, prange
 
 BAND = 16
-FEW = 12  # blocks: for triangles up to this size it pays to ask first whether they are hidden
+FEW = 30  # blocks: for triangles up to this size it pays to ask first whether they are hidden
 CHUNK = 512
 SUB = 256
 HALF = SUB // 2
@@ -62,7 +62,7 @@ class Frame(NamedTuple):
     of two is the nearer, and of equals the first triangle
     row_start : (bands + 1,)   row_list : triangles by band
     fragment : (h, N_WHOLE, 4 w) pixel, triangle and number of samples of each surface seen in each row, from left to
-    right, `count` (h,) of them
+    right; `found` (h,) of them
     A depth number is DEEPEST * near / depth, a whole number up to DEEPEST.
     """
 
@@ -77,7 +77,7 @@ class Frame(NamedTuple):
     row_start: np.ndarray
     row_list: np.ndarray
     fragment: np.ndarray
-    count: np.ndarray
+    found: np.ndarray
 
 
 def _aligned(rows: int, columns: int, kind: type) -> np.ndarray:
@@ -103,7 +103,7 @@ def buffers(n: int, t: int, width: int, height: int) -> Frame:
         row_start=np.zeros(bands + 1, np.int32),
         row_list=np.zeros(4 * t + 64, np.int32),
         fragment=np.zeros((height, N_WHOLE, 4 * width), np.int32),
-        count=np.zeros(height, np.int32),
+        found=np.zeros(height, np.int32),
     )
 
 
@@ -580,7 +580,7 @@ def coverage_pass(order, listed, mesh, camera, frame):
     """Fill `sample` and, if `listed`, the list of fragments; `order` (bands,) deals the bands out to the threads."""
     triangle, eye, screen, box, deep = mesh.triangle, frame.eye, frame.screen, frame.box, frame.deep
     row_start, row_list, sample = frame.row_start, frame.row_list, frame.sample
-    item, plane, fragment, count, width = mesh.item, frame.plane, frame.fragment, frame.count, int(2.0 * camera[C_X])
+    item, plane, fragment, count, width = mesh.item, frame.plane, frame.fragment, frame.found, int(2.0 * camera[C_X])
     for k in prange(order.shape[0]):
         b = order[k]
         _cover_band(b, triangle, eye, screen, box, deep, row_start, row_list, camera, sample)

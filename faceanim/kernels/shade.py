@@ -334,7 +334,7 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
     for y in range(band * BAND, min((band + 1) * BAND, out.shape[0])):
         ry = (camera[C_Y] - y - 0.5) / camera[C_FOCAL]
         height = np.float32(ry)
-        n, whole = frame.count[y], frame.fragment[y]
+        n, whole = frame.found[y], frame.fragment[y]
         _attribute_row(n, height, centre, focal, triangle, item, mesh.uv, frame.vertex, plane, row32, whole, number)
         first = 0
         while first < n:

@@ -139,7 +139,7 @@ class Planes(NamedTuple):
     before : (n, 3) positions at the last call   ball : (t, 4) bounding spheres of the triangles
     """
 
-    count: I4
+    count: I4  # type: ignore[assignment]
     node: I4
     weight: F8
     normal: F8

@@ -188,7 +188,8 @@ class Renderer:
                 self._moved[i], self._poses[i] = True, None
             elif item.bone is not None and bone_pose is not None:
                 pose = np.ascontiguousarray(bone_pose[item.bone], dtype=np.float64)
-                if self._poses[i] is None or not np.array_equal(pose, self._poses[i]):
+                last = self._poses[i]
+                if last is None or not np.array_equal(pose, last):
                     raster.carry(item.points, pose, target)
                     self._moved[i], self._poses[i] = True, pose.copy()
 
@@ -239,6 +240,6 @@ class Renderer:
             self._cover(layer)
             opacity = -1.0 if layer == self._layers[0] else self.layer_opacity
             tail = (self._frame, self._paint, self._shadow, self._steps, self._number, self._out)
-            order = dealt(np.add.reduceat(self._frame.count, np.arange(0, self.size[1], raster.BAND)))
+            order = dealt(np.add.reduceat(self._frame.found, np.arange(0, self.size[1], raster.BAND)))
             shade.shade_pass(order, opacity, self._mesh, self._numbers, *tail)
         return self._out

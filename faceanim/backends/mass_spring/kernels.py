@@ -62,11 +62,15 @@ def put(place, q, nodes, h, q_new, qd_new):
 
 
 @kernel
-def extrapolate(x, v, h):
-    """Move `x` (n, 3) on by h v."""
+def extrapolate(x, v, h, least):
+    """Move `x` (n, 3) on by h v, unless no vertex would go farther than `least` [mm]: noise must not be carried on."""
+    farthest = 0.0
     for i in range(len(x)):
-        for d in range(3):
-            x[i, d] += h * v[i, d]
+        farthest = max(farthest, v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
+    if h * math.sqrt(farthest) > least:
+        for i in range(len(x)):
+            for d in range(3):
+                x[i, d] += h * v[i, d]
 
 
 @kernel
@@ -240,12 +244,8 @@ def vertex_force(i, px, py, pz, x, scene, moment):
             j, l, c1, c2 = springs.c[q], springs.a[q], 2, 0
         else:
             j, l, c1, c2 = springs.a[q], springs.b[q], 0, 1
-        ux, uy, uz, kt, s = edge_pull(
-            px, py, pz, x, j, springs.edge_length[c2, q], springs.edge_stiffness[c2, q], law
-        )
-        vx, vy, vz, kv, sv = edge_pull(
-            px, py, pz, x, l, springs.edge_length[c1, q], springs.edge_stiffness[c1, q], law
-        )
+        ux, uy, uz, kt, s = edge_pull(px, py, pz, x, j, springs.edge_length[c2, q], springs.edge_stiffness[c2, q], law)
+        vx, vy, vz, kv, sv = edge_pull(px, py, pz, x, l, springs.edge_length[c1, q], springs.edge_stiffness[c1, q], law)
         fx += ux + vx
         fy += uy + vy
         fz += uz + vz
@@ -330,7 +330,7 @@ def chained_contacts(i, x, planes, stiffening, head, link):
             fx += f * planes.normal[c, 0]
             fy += f * planes.normal[c, 1]
             fz += f * planes.normal[c, 2]
-            k += abs(w) * planes.stiffness[c] * kt
+            k += abs(w) * planes.stiffness[c] * kt * (1.0 if planes.node[c, 1] < 0 else 2.0)
         at = link[at]
     return fx, fy, fz, k
 

@@ -28,7 +28,13 @@ class Load:
         pose = np.zeros((patch.scene.tethers.bone_weight.shape[1], 4, 4))
         planes = build.room_for_planes(patch.scene.colliders, n)
         self.moment = Moment(
-            np.zeros((n, 3)), pose, np.zeros(n + 1, dtype=np.int32), np.zeros((e, 3)), np.zeros(e), np.zeros(e), planes,
+            np.zeros((n, 3)),
+            pose,
+            np.zeros(n + 1, dtype=np.int32),
+            np.zeros((e, 3)),
+            np.zeros(e),
+            np.zeros(e),
+            planes,
             np.zeros((n, 3)),
         )
         self.activation = np.zeros(patch.muscles)
@@ -42,6 +48,15 @@ class Load:
             attachment.carry(scene.tethers, moment.pose, moment.anchor)
         self.activation[:] = control.activation
         muscles.aim(scene.fibres, control.activation, moment.pose, moment)
+
+    def rest(self) -> None:
+        """Set everything as at rest: positions, bones, muscles, contacts."""
+        scene, moment = self.patch.scene, self.moment
+        moment.pose[:] = np.eye(4)
+        attachment.carry(scene.tethers, moment.pose, moment.anchor)
+        moment.first[:] = 0
+        self.x[:] = scene.tethers.rest
+        self.touch(self.x, 0.0)
 
     def touch(self, x: Floats, reach: float, pair_reach: float | None = None) -> None:
         """Find the contacts nearer than `reach` [mm] at `x`, those of lips and lids nearer than `pair_reach`."""

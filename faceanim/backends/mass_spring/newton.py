@@ -177,7 +177,9 @@ class Newton:
     def _assemble(self, x: Floats, exact: bool) -> None:
         self.exact = exact
         load, patch = self.load, self.load.patch
-        tangent.spring_matrix(x, patch.scene.springs, patch.scene.law, patch.edge_of, int(exact), self.diagonal, self.coupling)
+        tangent.spring_matrix(
+            x, patch.scene.springs, patch.scene.law, patch.edge_of, int(exact), self.diagonal, self.coupling
+        )
         attachment.shear_coupling(patch.shear, len(patch.shear), self.coupling)
         soft = SOFTEST * float(self.diagonal[: patch.m, [0, 3, 5]].mean()) if patch.m else 0.0
         contact.plane_tangent(x, load.moment.planes, patch.scene.colliders.stiffening, self.tangent)

@@ -20,7 +20,7 @@ PAIR_REACH = 0.3
 """The same for lips and lids, whose search is the dearest."""
 HIGHEST = 2.0
 """No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
-MARGIN = 1.06
+MARGIN = 1.2
 """What is added to the largest such eigenvalue measured at rest; it hardly changes when the skin deforms."""
 RESOLVED = 1.5
 """n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
@@ -95,7 +95,7 @@ class _Implicit(_Patchwise):
             motion.q, motion.qd, motion.q_before, motion.qd_before, patch.nodes, patch.mass, patch.m, self.drag, gamma,
             now, before, self.centre, self.weight,
         )  # fmt: skip
-        kernels.extrapolate(x, self.v, h)
+        kernels.extrapolate(x, self.v, h, self.options.sweep_tolerance)
         self.load.touch(x, REACH, PAIR_REACH)
         self._minimise(gamma, report)
         kernels.finish(
@@ -147,7 +147,7 @@ class QuasiStatic(_Patchwise):
         load, patch, x = self.load, self.load.patch, self.load.x
         kernels.gather(motion.q_new, motion.qd, patch.nodes, patch.held, load.moment, x, self.v)
         self.v[patch.m :] = 0.0
-        kernels.extrapolate(x, self.v, h)
+        kernels.extrapolate(x, self.v, h, self.options.sweep_tolerance)
         load.touch(x, REACH, PAIR_REACH)
         options, scene = self.options, patch.scene
         if options.quasi_static == "chebyshev":
@@ -262,12 +262,9 @@ class Explicit(_Patchwise):
     def largest_step(self) -> float:
         """Return the largest stable step at rest [s]."""
         load, patch = self.load, self.load.patch
-        load.x[:] = patch.scene.tethers.rest
-        load.touch(load.x, 0.0)
+        load.rest()
         force = load.forces(load.x)
-        return float(
-            kernels.largest_substep(patch.scene, patch.mass, self.drag, 1.0, self.options.safety, force)
-        )
+        return float(kernels.largest_substep(patch.scene, patch.mass, self.drag, 1.0, self.options.safety, force))
 
 
 SCHEMES: dict[str, type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | type[Paper] | type[Explicit]] = {
@@ -284,8 +281,7 @@ class Spectrum:
 
     def __init__(self, load: Load) -> None:
         self.load = load
-        load.x[:] = load.patch.scene.tethers.rest
-        load.touch(load.x, 0.0)
+        load.rest()
         self.stiffness = load.forces(load.x)[:, 3].copy()
         self.high = min(HIGHEST, MARGIN * self._largest())
 

@@ -206,7 +206,8 @@ class SolverMassSpring:
     def prepare(self, controls: Control | Sequence[Control]) -> Partition | None:
         """Compute, or read from the cache, the adaptive partition for these peak controls, and use it from now on.
 
-        Without `Options(adaptive=True)` there is nothing to prepare: returns None. The union of what they activate is integrated; see `Partition`. A step prepares itself
+        Without `Options(adaptive=True)` there is nothing to prepare: returns None. The union of what they
+        activate is integrated; see `Partition`. A step prepares itself
         when a muscle or bone acts that no partition was made for, then as if every acting muscle reached 1.
         """
         peaks = [controls] if isinstance(controls, Control) else list(controls)
@@ -258,7 +259,8 @@ class SolverMassSpring:
         motion.q, motion.qd, motion.t = state.q, state.qd, state.t
         before, rate = getattr(state, "q_before", None), getattr(state, "qd_before", None)
         known = before is not None and rate is not None
-        motion.q_before, motion.qd_before = (before, rate) if known else (state.q, state.qd)
+        motion.q_before = before if before is not None and known else state.q
+        motion.qd_before = rate if rate is not None and known else state.qd
         motion.dt_before = getattr(state, "dt_before", 0.0) if known else 0.0
         motion.q_new[:] = state.q
         motion.qd_new[:] = 0.0
