@@ -126,7 +126,7 @@ def two_lips(gap: float = 0.3) -> Body:
     n = len(upper.points)
     # the upper sheet looks down, the lower one up; shifted so that vertices meet triangles
     turn = np.array([1.0, -1.0, -1.0])
-    points = np.concatenate([upper.points * turn + [0.0, 0.0, 2.0], [*lower.points, 0.4, 0.3, 0.0]])
+    points = np.concatenate([upper.points * turn + [0.0, 0.0, 2.0], lower.points + np.array([0.4, 0.3, 0.0])])
     triangles = np.concatenate([upper.triangles, lower.triangles + n])
     surface = TriMesh(points, triangles)
     t = len(upper.triangles)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import get_thread_id  # type: ignore[attr-defined]
 
 from faceanim.ground.jit import kernel, prange
 
@@ -58,8 +59,9 @@ class Frame(NamedTuple):
     vertex : (n, 8) normal, occlusion, linear colour, depth   plane : (t, 16) rows E_i and the P_ columns
     deep : (t, 8) depth number: gradient in x and y, value at pixel (0, 0), least, largest; side (1 front, -1 back)
     box : (t, 4) first and last pixel in x and y; empty if culled
-    sample : (h, ceil(w / 4), 16) four a pixel, 0 = none: depth number << 32 | LAST_NAME - triangle, so that the larger
-    of two is the nearer, and of equals the first triangle
+    sample : (slots, BAND, ceil(w / 4), 16) four a pixel, 0 = none: depth number << 32 | LAST_NAME - triangle, so that
+    the larger of two is the nearer, and of equals the first triangle
+    nearest : (h, w) depth number of the nearest sample, 0 = none
     row_start : (bands + 1,)   row_list : triangles by band
     fragment : (h, N_WHOLE, 4 w) pixel, triangle and number of samples of each surface seen in each row, from left to
     right; `found` (h,) of them
@@ -74,6 +76,7 @@ class Frame(NamedTuple):
     deep: np.ndarray
     box: np.ndarray
     sample: np.ndarray
+    nearest: np.ndarray
     row_start: np.ndarray
     row_list: np.ndarray
     fragment: np.ndarray
@@ -88,8 +91,16 @@ def _aligned(rows: int, columns: int, kind: type) -> np.ndarray:
     return raw[skip : skip + rows * columns].reshape(rows, columns)
 
 
-def buffers(n: int, t: int, width: int, height: int) -> Frame:
-    """Return the buffers for n vertices, t triangles and a picture of that size [pixel]."""
+def sample_buffer(slots: int, width: int) -> np.ndarray:
+    """Return room for the samples of so many bands of a picture of that width [pixel]."""
+    return np.zeros((slots, BAND, (width + 3) // 4, 16), np.int64)
+
+
+def buffers(n: int, t: int, width: int, height: int, slots: int) -> Frame:
+    """Return the buffers for n vertices, t triangles and a picture of that size [pixel].
+
+    slots : bands whose samples are kept at a time: one a thread, or all bands if `coverage_pass` is to keep them
+    """
     bands = -(-height // BAND)
     return Frame(
         facet=np.zeros((t, 3), np.float32),
@@ -99,7 +110,8 @@ def buffers(n: int, t: int, width: int, height: int) -> Frame:
         plane=_aligned(t, 16, np.float32),
         deep=_aligned(t, 8, np.float64),
         box=np.zeros((t, 4), np.int32),
-        sample=np.zeros((height, (width + 3) // 4, 16), np.int64),
+        sample=sample_buffer(slots, width),
+        nearest=np.zeros((height, width), np.int32),
         row_start=np.zeros(bands + 1, np.int32),
         row_list=np.zeros(4 * t + 64, np.int32),
         fragment=np.zeros((height, N_WHOLE, 4 * width), np.int32),
@@ -436,14 +448,14 @@ def _largest(a, b):
 
 
 @kernel
-def _hidden(lo_u, hi_u, lo_y, hi_y, most, sample):
+def _hidden(lo_u, hi_u, lo_y, hi_y, base, most, sample):
     """Whether every sample of these blocks already shows something nearer than the depth number `most` (fine)."""
     key = (most >> FINE) << 32
     for y in range(lo_y, hi_y + 1):
         for u in range(lo_u, hi_u + 1):
-            least = sample[y, u, 0]
+            least = sample[y - base, u, 0]
             for q in range(1, 16):
-                s = sample[y, u, q]
+                s = sample[y - base, u, q]
                 least = s if s < least else least
             if least <= key + LAST_NAME:
                 return False
@@ -451,10 +463,11 @@ def _hidden(lo_u, hi_u, lo_y, hi_y, most, sample):
 
 
 @kernel
-def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, sample):
+def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, base, sample):
     """Write the samples of one screen triangle (positive orientation) that are nearer than what is there.
 
-    z : depth number at the centre of pixel (lo_x, lo_y), gx, gy its steps   name : the number of the triangle, turned
+    z : depth number at the centre of pixel (lo_x, lo_y), gx, gy its steps   name : LAST_NAME - triangle
+    base : first row of `sample`
     Four pixels, 16 samples, are tested at a time; the larger of old and new sample stays.
     """
     lo_x &= ~3
@@ -478,8 +491,8 @@ def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, mos
                     near = near if near < most else most
                     key = ((near >> FINE) << 32) | name
                     key = key if e >= 0 else 0
-                    old = sample[y, u, q]
-                    sample[y, u, q] = key if key > old else old
+                    old = sample[y - base, u, q]
+                    sample[y - base, u, q] = key if key > old else old
             e0 += a0
             e1 += a1
             e2 += a2
@@ -538,11 +551,11 @@ def _list_row(width, sample, item, plane, whole):
 
 
 @kernel
-def _cover_band(band, triangle, eye, screen, box, deep, row_start, row_list, camera, sample):
+def _cover_band(band, height, triangle, eye, screen, box, deep, row_start, row_list, camera, sample):
     """Clear one band of rows and draw its triangles into it."""
     first = band * BAND
-    last = min(first + BAND, sample.shape[0]) - 1
-    sample[first : last + 1] = 0
+    last = min(first + BAND, height) - 1
+    sample[:] = 0
     for k in range(row_start[band], row_start[band + 1]):
         t = row_list[k]
         a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
@@ -560,29 +573,39 @@ def _cover_band(band, triangle, eye, screen, box, deep, row_start, row_list, cam
         z = np.int64(deep[t, 2] + deep[t, 0] * ((lo_x & ~3) + 0.5) + deep[t, 1] * (lo_y + 0.5))
         name = np.int64(LAST_NAME - t)
         lo_u, hi_u = lo_x >> 2, hi_x >> 2
-        if (hi_u - lo_u + 1) * (hi_y - lo_y + 1) <= FEW and _hidden(lo_u, hi_u, lo_y, hi_y, most, sample):
+        if (hi_u - lo_u + 1) * (hi_y - lo_y + 1) <= FEW and _hidden(lo_u, hi_u, lo_y, hi_y, first, most, sample):
             continue
         if (x0 != x1 or y0 != y1) and (x1 != x2 or y1 != y2):
-            _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, sample)
+            _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, first, sample)
         if x3 != x2 or y3 != y2:
-            _cover(x0, y0, x2, y2, x3, y3, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, sample)
+            _cover(x0, y0, x2, y2, x3, y3, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, first, sample)
 
 
 @kernel
-def _list_band(band, width, item, plane, sample, fragment, count):
-    """List the fragments of one band of rows."""
-    for y in range(band * BAND, min((band + 1) * BAND, sample.shape[0])):
-        count[y] = _list_row(width, sample[y], item, plane, fragment[y])
+def _list_band(band, item, plane, sample, fragment, found, nearest):
+    """List the fragments of one band of rows and note the nearest depth of each pixel."""
+    height, width = nearest.shape
+    first = band * BAND
+    for y in range(first, min(first + BAND, height)):
+        found[y] = _list_row(width, sample[y - first], item, plane, fragment[y])
+        for x in range(width):
+            u, q = x >> 2, 4 * (x & 3)
+            s = sample[y - first]
+            nearest[y, x] = max(s[u, q], s[u, q + 1], s[u, q + 2], s[u, q + 3]) >> 32
 
 
 @kernel(parallel=True)
 def coverage_pass(order, listed, mesh, camera, frame):
-    """Fill `sample` and, if `listed`, the list of fragments; `order` (bands,) deals the bands out to the threads."""
+    """Find the nearest triangle of every sample, band by band; `order` (bands,) deals the bands out to the threads.
+
+    listed : list fragments and nearest depths, samples live in the slot of the thread; else keep them, band b in slot b
+    """
     triangle, eye, screen, box, deep = mesh.triangle, frame.eye, frame.screen, frame.box, frame.deep
-    row_start, row_list, sample = frame.row_start, frame.row_list, frame.sample
-    item, plane, fragment, count, width = mesh.item, frame.plane, frame.fragment, frame.found, int(2.0 * camera[C_X])
+    row_start, row_list, sample, height = frame.row_start, frame.row_list, frame.sample, int(2.0 * camera[C_Y])
+    item, plane, fragment, found, nearest = mesh.item, frame.plane, frame.fragment, frame.found, frame.nearest
     for k in prange(order.shape[0]):
         b = order[k]
-        _cover_band(b, triangle, eye, screen, box, deep, row_start, row_list, camera, sample)
+        room = sample[get_thread_id() if listed else b]
+        _cover_band(b, height, triangle, eye, screen, box, deep, row_start, row_list, camera, room)
         if listed:
-            _list_band(b, width, item, plane, sample, fragment, count)
+            _list_band(b, item, plane, room, fragment, found, nearest)

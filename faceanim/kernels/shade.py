@@ -100,12 +100,12 @@ def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, row,
 
 
 @kernel
-def _contact_run(first, last, y, width, camera, row, step, sample, whole, number):
+def _contact_run(first, last, y, camera, row, step, nearest, whole, number):
     """Darken fragments first..last-1 of the material `row` that nearer surfaces shade, those above counting most.
 
     `step` (taps, 3): offsets in units of the shade radius (y up) and weight.
     """
-    height, unit = sample.shape[0], DEEPEST * camera[C_NEAR]
+    height, width, unit = nearest.shape[0], nearest.shape[1], DEEPEST * camera[C_NEAR]
     for i in range(first, last):
         x, z = whole[W_PIXEL, i], number[A_DEPTH, i] + 0.0
         radius = row[M_SHADE_RADIUS] * camera[C_FOCAL] / z
@@ -113,11 +113,8 @@ def _contact_run(first, last, y, width, camera, row, step, sample, whole, number
         for k in range(step.shape[0]):
             tx = min(max(int(x + radius * step[k, 0] + 0.5), 0), width - 1)
             ty = min(max(int(y - radius * step[k, 1] + 0.5), 0), height - 1)
-            q = 4 * (tx & 3)
-            for j in range(q, q + 4):
-                s = sample[ty, tx >> 2, j]
-                if s > 0:
-                    shade += 0.25 * step[k, 2] * min(max(0.6 * (z - unit / (s >> 32) - 0.25), 0.0), 1.0)
+            if nearest[ty, tx] > 0:
+                shade += step[k, 2] * min(max(0.6 * (z - unit / nearest[ty, tx] - 0.25), 0.0), 1.0)
         number[A_OPEN, i] *= max(1.0 - row[M_SHADE] * shade, 0.0)
 
 
@@ -329,7 +326,7 @@ def _blend_row(n, opacity, table, whole, number, row):
 def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number, out):
     """Colour one band of rows; over the background, or over `out` if opacity is not negative."""
     triangle, item, plane, material = mesh.triangle, mesh.item, frame.plane, paint.material
-    sample, row32, table, width = frame.sample, paint.material32, paint.encode, out.shape[1]
+    row32, table = paint.material32, paint.encode
     centre, focal = np.float32(camera[C_X]), np.float32(camera[C_FOCAL])
     for y in range(band * BAND, min((band + 1) * BAND, out.shape[0])):
         ry = (camera[C_Y] - y - 0.5) / camera[C_FOCAL]
@@ -343,7 +340,7 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
                 last += 1
             colour, row = A_RED, material[m]
             if row[M_SHADE_RADIUS] > 0.0:
-                _contact_run(first, last, y, width, camera, row, step, sample, whole, number)
+                _contact_run(first, last, y, camera, row, step, frame.nearest, whole, number)
             if row[M_SOURCE] == 1.0:
                 k = int(row[M_TEXTURE])
                 top, colour = np.float32(paint.level_count[k] - 1), A_TEXTURE

@@ -12,7 +12,7 @@ import numpy as np
 
 from faceanim.ground.jit import kernel, prange
 from faceanim.kernels.memory import STORE, load
-from faceanim.kernels.raster import C_NEAR, C_POSITION, DEEPEST, project
+from faceanim.kernels.raster import BAND, C_NEAR, C_POSITION, DEEPEST, project
 
 ROWS = 16
 
@@ -52,7 +52,7 @@ def _moments(first, last, camera, middle, far, sample, moment):
         for x in range(moment.shape[1]):
             mean, square, q = 0.0, 0.0, 4 * (x & 3)
             for s in range(q, q + 4):
-                name = sample[y, x >> 2, s]
+                name = sample[y // BAND, y % BAND, x >> 2, s]
                 d = far if name == 0 else min(unit / (name >> 32) - middle, far)
                 mean += 0.25 * d
                 square += 0.25 * d * d

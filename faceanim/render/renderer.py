@@ -9,6 +9,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from faceanim.ground.arrays import Floats, Ints, floats, ints
 from faceanim.ground.errors import RunError, UserError
@@ -135,7 +136,8 @@ class Renderer:
         self._layers = sorted({item.material.layer for item in items})
         self._first = np.cumsum([0] + [len(item.points) for item in items]).astype(np.int32)
         self._mesh = _joined(self.items, self._first)
-        self._frame = raster.buffers(int(self._first[-1]), len(self._mesh.triangle), width, height)
+        slots = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        self._frame = raster.buffers(int(self._first[-1]), len(self._mesh.triangle), width, height, slots)
         self._paint = paint_tables([item.material for item in items], self.look, height)
         self._points = np.concatenate([item.points for item in items])
         self._steps = _contact_steps()
@@ -147,6 +149,7 @@ class Renderer:
         use = self.look.shadow and bool(casts.any())
         self._shadow_map = ShadowMap(self._mesh, casts, self._points, self._paint) if use else None
         self._shadow = no_shadow()
+        self._samples: NDArray[np.int64] | None = None
         self._out = np.zeros((height, width, 3), np.uint8)
         self.camera = camera
         for i, item in enumerate(self.items):
@@ -193,8 +196,8 @@ class Renderer:
                     raster.carry(item.points, pose, target)
                     self._moved[i], self._poses[i] = True, pose.copy()
 
-    def _cover(self, layer: int) -> None:
-        """Fill the sample buffers with one layer."""
+    def _cover(self, layer: int, listed: bool = True) -> None:
+        """Find what is seen of one layer: the list of fragments, or (not `listed`) all samples."""
         if len(self._layers) > 1:  # what the other layer left in the tables is of no use
             self._moved[:] = True
         raster.setup_pass(self._moved, self._mesh, self._numbers, float(layer), self._frame, self._paint)
@@ -203,7 +206,7 @@ class Renderer:
             self._frame = raster.longer_list(self._frame)
             raster.band_pass(self._frame)
         order = dealt(np.diff(self._frame.row_start))
-        raster.coverage_pass(order, True, self._mesh, self._numbers, self._frame)
+        raster.coverage_pass(order, listed, self._mesh, self._numbers, self._frame)
 
     def _prepare(self) -> None:
         """Normals and projection of all vertices."""
@@ -217,9 +220,16 @@ class Renderer:
     def depth(self) -> Floats:
         """Return the depth [mm] of the four samples of each pixel as last placed, (h, w, 4), inf where nothing is."""
         self._prepare()
-        self._cover(self._layers[0])
         width, height = self.size
-        number = (self._frame.sample >> 32).reshape(height, -1, 4)[:, :width]
+        kept, bands = self._frame.sample, len(self._frame.row_start) - 1
+        if self._samples is None:
+            self._samples = raster.sample_buffer(bands, width)
+        self._frame = self._frame._replace(sample=self._samples)
+        try:
+            self._cover(self._layers[0], listed=False)
+        finally:
+            self._frame = self._frame._replace(sample=kept)
+        number = (self._samples >> 32).reshape(bands * raster.BAND, -1, 4)[:height, :width]
         with np.errstate(divide="ignore"):
             return raster.DEEPEST * self.camera.near / number
 

@@ -34,7 +34,7 @@ class ShadowMap:
         material = paint.material.copy()
         material[:, raster.M_SIDED] = 0.0  # back sides lie behind fronts
         self._paint = paint._replace(material=material)
-        self._frame = raster.buffers(len(points), len(self._mesh.triangle), SIZE, SIZE)
+        self._frame = raster.buffers(len(points), len(self._mesh.triangle), SIZE, SIZE, -(-SIZE // raster.BAND))
         self._moved = np.ones(len(paint.material), np.bool_)
         self._order = np.arange(len(self._frame.row_start) - 1, dtype=np.int32)[::-1].copy()
         used = points[np.unique(self._mesh.triangle)]

@@ -219,15 +219,8 @@ def height_push(ix, iy, iz, ax, ay, az, bx, by, bz, rest, stiffness, repulsion, 
 
 
 @kernel
-def vertex_force(i, px, py, pz, x, scene, moment):
-    """Return the force on free vertex `i` if it were at p and the others at `x`, its stiffness bound and secant sum.
-
-    (fx, fy, fz, k, k_secant): springs, tether and muscles; contacts not. `moment.shift` must hold the others' positions
-    minus their anchors; row `i` is written. The secant sum is the paper's (Eq. 18), which
-    a compressed spring makes negative.
-    """
-    springs = scene.springs
-    law = scene.law
+def vertex_springs(i, px, py, pz, x, springs, law):
+    """Return the force of the springs on vertex `i` if it were at p, their stiffness bound and secant sum."""
     total = springs.a.size
     fx = 0.0
     fy = 0.0
@@ -282,6 +275,18 @@ def vertex_force(i, px, py, pz, x, scene, moment):
             fz -= t * uz
             k += 0.5 * abs(t) * (1.0 + abs(t) + abs(1.0 - t)) * kt
             ks += t * t * s
+    return fx, fy, fz, k, ks
+
+
+@kernel
+def vertex_force(i, px, py, pz, x, scene, moment):
+    """Return the force on free vertex `i` if it were at p and the others at `x`, its stiffness bound and secant sum.
+
+    (fx, fy, fz, k, k_secant): springs, tether and muscles; contacts not. `moment.shift` must hold the others' positions
+    minus their anchors; row `i` is written. The secant sum is the paper's (Eq. 18), which
+    a compressed spring makes negative.
+    """
+    fx, fy, fz, k, ks = vertex_springs(i, px, py, pz, x, scene.springs, scene.law)
     moment.shift[i, 0] = px - moment.anchor[i, 0]
     moment.shift[i, 1] = py - moment.anchor[i, 1]
     moment.shift[i, 2] = pz - moment.anchor[i, 2]

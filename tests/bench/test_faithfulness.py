@@ -1,0 +1,40 @@
+"""The calibrated muscles of the default face against the artist's shapes and against published movements."""
+
+from __future__ import annotations
+
+import pytest
+
+from faceanim.bench.faithfulness import ARTIST_UNITS, Poser, artist_fields, artist_matches, match_field, movements
+from faceanim.face.library import load_face
+
+
+@pytest.fixture(scope="module")
+def poser() -> Poser:
+    """The default face, each action unit solved once."""
+    return Poser(load_face())
+
+
+def test_a_field_matches_itself() -> None:
+    """An artist's field compared with itself has cosine 1 and the same peak; turned round, cosine -1."""
+    face = load_face("default", "coarse")
+    for unit, name in ARTIST_UNITS.items():
+        field = artist_fields("coarse")[name]
+        same = match_field(face, unit, name, field, field)
+        assert same.mean_cosine == pytest.approx(1.0)
+        assert same.peak_ratio == pytest.approx(1.0)
+        assert match_field(face, unit, name, -field, field).mean_cosine == pytest.approx(-1.0)
+
+
+@pytest.mark.slow
+def test_action_units_move_as_the_artist_shapes_do(poser: Poser) -> None:
+    """Mean cosine at least 0.80 over the moving region, peak within 30 % (to two digits)."""
+    for match in artist_matches(poser):
+        assert match.mean_cosine >= 0.80, match
+        assert 0.70 <= round(match.peak_ratio, 2) <= 1.30, match
+
+
+@pytest.mark.slow
+def test_movements_lie_in_the_published_ranges(poser: Poser) -> None:
+    """Smile, brow, nose, lids, jaw, pucker and funnel reach what people reach (to a tenth)."""
+    for movement in movements(poser):
+        assert movement.low <= round(movement.value, 1) <= movement.high, movement
