@@ -107,7 +107,7 @@ def accelerated_sweeps(
     Each sweep divides every vertex's residual by w + k, with the k of the moment: stiffening and new contacts count
     at once. [low, high] : the eigenvalues to damp, of the matrix so scaled (at most 2)
     force : (n, 4), move : (n, 3) work   tolerance : stop when no vertex wants to go farther [mm]
-    reach, pair_reach : of the contacts; when vertices may have used up half of it, contacts are found anew
+    reach, pair_reach : of the contacts, found anew halfway if vertices may have used up half of it by then
     Returns (sweeps made, largest residual [mN], largest wish [mm]) of the last sweep, before it moved.
     """
     middle = 0.5 * (high + low)
@@ -142,9 +142,8 @@ def accelerated_sweeps(
                 x[i, d] += move[i, d]
                 moment.shift[i, d] += move[i, d]
         travel += math.sqrt(farthest)
-        if travel > 0.5 * pair_reach:
+        if sweep == sweeps // 2 and travel > 0.5 * pair_reach:
             find(x, scene.colliders, scene.grids, moment.pose, reach, pair_reach, moment.planes)
-            travel = 0.0
         # A single sweep must not count as a solution unless nothing moves at all: its small errors would add up.
         if wish < tolerance * tolerance and (sweep >= 3 or wish < 1e-8 * tolerance * tolerance):
             return sweep + 1, math.sqrt(residual), math.sqrt(wish)
