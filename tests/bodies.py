@@ -92,7 +92,12 @@ def held_sheet(nx: int = 14, ny: int = 14, *, colliders: bool = True, force: flo
         "law": SpringLaw(),
         "damping": 2000.0,
         "pinned": pinned,
-        "attachment": Attachment(np.stack([1.0 - jaw, jaw], axis=1), surface.vertex_areas * 0.8),
+        "attachment": Attachment(
+            np.stack([1.0 - jaw, jaw], axis=1),
+            surface.vertex_areas * 0.8,
+            shear=np.full(len(surface.triangles), 3.0),
+            shear_limit=np.full(len(surface.triangles), 0.4),
+        ),  # fmt: skip
         "muscles": two_muscles(x, ~pinned, force),
         "bones": bones,
         "bone_contact": bone_contact,

@@ -29,11 +29,13 @@ class Attachment:
     Force on i: -k (1 + (s/s0)^2)^alpha (x_i - a_i), s = |x_i - a_i|.
 
     Beyond its springs the hypodermis is a layer that resists shear (a Pasternak foundation): with u = x - a, it stores
-    shear / 2 * |grad u|^2 per area, which keeps a compressed skin from crumpling.
+    shear / 2 * |grad u|^2 per area, which keeps a compressed skin from crumpling. Connective tissue stiffens as it
+    shears: at a gradient of `shear_limit` the stiffness has doubled, and a fold, which needs a gradient of 1, is dear.
 
     bone_weight : (n, n_bone) [-], rows sum to 1
     stiffness : (n,) [mN/mm], zero where nothing lies beneath
     shear : (t,) [mN/mm], shear modulus times effective depth of the layer under each triangle; None = no such layer
+    shear_limit : (t,) [-]; None or inf = it never stiffens
     """
 
     bone_weight: Floats
@@ -41,6 +43,7 @@ class Attachment:
     alpha: float = 1.0
     s0: float = 5.0
     shear: Floats | None = None
+    shear_limit: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +150,7 @@ class Body:
             ("attachment.bone_weight", self.attachment.bone_weight, (n, b)),
             ("attachment.stiffness", self.attachment.stiffness, (n,)),
             ("attachment.shear", self.attachment.shear, (t,)),
+            ("attachment.shear_limit", self.attachment.shear_limit, (t,)),
         ):
             if array is None:
                 continue

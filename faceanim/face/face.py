@@ -206,7 +206,8 @@ class Face:
         stiffness = 0.5 * (stiffness + stiffness[self.mirror])
         lids = (self.region[self.mesh.triangles] == LID).any(axis=1)
         shear = np.where(lids, h.shear * h.lid_shear, h.shear)
-        return Attachment(self.bone_weight, stiffness, h.alpha, h.s0, shear)
+        limit = np.full(len(lids), h.shear_limit)
+        return Attachment(self.bone_weight, stiffness, h.alpha, h.s0, shear, limit)
 
     def body(self) -> Body:
         """Return this head as a body that any backend can move."""

@@ -221,6 +221,10 @@ def _sphincter(name: str, m: SphincterMuscle, t: Terrain) -> list[_Zone]:
     return [_zone(name, raw, goal, softening=m.softening)]
 
 
+_CANTHUS = 5.0
+"""Where the lids are nearer to each other than this at rest [mm] they hang together, and the ring pulls less."""
+
+
 def _margin_height(t: Terrain, margin: Ints) -> Floats:
     """Height of a lid margin [mm] at every vertex's x, (n,)."""
     order = margin[np.argsort(t.points[margin, 0])]
@@ -237,7 +241,8 @@ def _lid(name: str, m: LidMuscle, t: Terrain, side: str) -> list[_Zone]:
     lateral = _bump((t.points[:, 0] - centre) / (1.15 * half))
     above = t.points[:, 1] >= line
     away = np.where(above, t.points[:, 1] - upper, lower - t.points[:, 1])
-    raw = t.area * near * lateral * _bump(np.maximum(away, 0.0) / m.reach)
+    opening = np.clip((upper - lower) / _CANTHUS, 0.0, 1.0) ** 2
+    raw = t.area * near * lateral * opening * _bump(np.maximum(away, 0.0) / m.reach)
     goal = t.points.copy()
     goal[:, 1] = line + np.where(above, 0.35, -0.35) * np.maximum(away, 0.0)
     radius = np.linalg.norm(t.points - eye.centre, axis=1)

@@ -32,7 +32,8 @@ class Hypodermis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The tie from skin to bone.
 
     modulus [kPa], smallest_thickness [mm], alpha [-], s0 [mm] of its growth; factors lip, lid, mucosa [-];
-    shear [mN/mm] of the layer (shear modulus times effective depth), lid_shear [-] its factor on the lids;
+    shear [mN/mm] of the layer (shear modulus times effective depth), shear_limit [-] the gradient at which it has
+    doubled, lid_shear [-] the factor on the lids, which do not stiffen;
     fade_length [mm] from the openings; clear_choice, blend_length [mm] of the share between cranium and jaw
     """
 
@@ -44,6 +45,7 @@ class Hypodermis(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lid: float
     mucosa: float
     shear: float
+    shear_limit: float
     lid_shear: float
     fade_length: float
     clear_choice: float

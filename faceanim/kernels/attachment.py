@@ -2,7 +2,7 @@
 
 Energy of one tether of length s: k s0^2 / (2 (alpha + 1)) [(1 + (s/s0)^2)^(alpha + 1) - 1]; force and tangent are its
 first and second derivatives. The shear layer couples the displacements u = x - anchor of neighbours i, j with the
-energy w/2 |u_i - u_j|^2 per edge. All kernels add to what `force` (n, 4) (three components and a stiffness bound) holds.
+energy w/2 d^2 + b/4 d^4 per edge, d = |u_i - u_j|: convex, and ever stiffer the more the skin would fold. All kernels add to what `force` (n, 4) (three components and a stiffness bound) holds.
 """
 
 from __future__ import annotations
@@ -50,6 +50,18 @@ def growth(q, alpha):
 
 
 @kernel(inline=True)
+def tether_pull(shift, i, tethers):
+    """Return the force of the tether on vertex `i`, without the shear layer; shift : (n, 3) positions minus anchors."""
+    dx = load(shift, 3 * i)
+    dy = load(shift, 3 * i + 1)
+    dz = load(shift, 3 * i + 2)
+    q = (dx * dx + dy * dy + dz * dz) / (tethers.s0 * tethers.s0)
+    secant, _ = growth(q, tethers.alpha)
+    secant *= tethers.stiffness[i]
+    return -secant * dx, -secant * dy, -secant * dz
+
+
+@kernel(inline=True)
 def tie(shift, i, tethers):
     """Return the force of tether and shear layer on vertex `i`, its bound of the stiffness and the tether's secant one.
 
@@ -61,17 +73,23 @@ def tie(shift, i, tethers):
     q = (dx * dx + dy * dy + dz * dz) / (tethers.s0 * tethers.s0)
     secant, tangent = growth(q, tethers.alpha)
     secant *= tethers.stiffness[i]
-    total = tethers.shear_sum[i]
-    fx = -(secant + total) * dx
-    fy = -(secant + total) * dy
-    fz = -(secant + total) * dz
+    fx = -secant * dx
+    fy = -secant * dy
+    fz = -secant * dz
+    bound = tethers.stiffness[i] * tangent
     for e in range(tethers.start[i], tethers.start[i + 1]):
         j = 3 * np.intp(load(tethers.neighbour, e))
-        w = load(tethers.shear, e)
-        fx += w * load(shift, j)
-        fy += w * load(shift, j + 1)
-        fz += w * load(shift, j + 2)
-    return fx, fy, fz, tethers.stiffness[i] * tangent + total, secant + total
+        ux = dx - load(shift, j)
+        uy = dy - load(shift, j + 1)
+        uz = dz - load(shift, j + 2)
+        growing = load(tethers.shear_growth, e) * (ux * ux + uy * uy + uz * uz)
+        w = load(tethers.shear, e) + growing
+        fx -= w * ux
+        fy -= w * uy
+        fz -= w * uz
+        secant += w
+        bound += w + 2.0 * growing
+    return fx, fy, fz, bound, secant
 
 
 @kernel
@@ -112,19 +130,29 @@ def tether_energy(x, anchor, tethers, m):
     for i in range(m):
         for e in range(tethers.start[i], tethers.start[i + 1]):
             j = tethers.neighbour[e]
-            share = 0.25 if j < m else 0.5
+            square = 0.0
             for d in range(3):
-                total += share * tethers.shear[e] * (x[i, d] - anchor[i, d] - x[j, d] + anchor[j, d]) ** 2
+                square += (x[i, d] - anchor[i, d] - x[j, d] + anchor[j, d]) ** 2
+            share = 0.5 if j < m else 1.0
+            total += share * square * (0.5 * tethers.shear[e] + 0.25 * tethers.shear_growth[e] * square)
     return total
 
 
 @kernel
-def shear_coupling(shear, n_pair, coupling):
-    """Add the shear layer's part of the Hessian to the off-diagonal blocks `coupling` (e, 9) of the first edges."""
-    for e in range(n_pair):
-        coupling[e, 0] -= shear[e]
-        coupling[e, 4] -= shear[e]
-        coupling[e, 8] -= shear[e]
+def shear_coupling(x, anchor, pairs, shear, growth, coupling):
+    """Add the shear layer's part of the Hessian, -(w + b d^2) I - 2 b u u^T, to the blocks `coupling` (e, 9) of `pairs`."""
+    for e in range(len(pairs)):
+        i, j = pairs[e]
+        u = (
+            x[i, 0] - anchor[i, 0] - x[j, 0] + anchor[j, 0],
+            x[i, 1] - anchor[i, 1] - x[j, 1] + anchor[j, 1],
+            x[i, 2] - anchor[i, 2] - x[j, 2] + anchor[j, 2],
+        )
+        even = shear[e] + growth[e] * (u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+        for r in range(3):
+            coupling[e, 4 * r] -= even
+            for c in range(3):
+                coupling[e, 3 * r + c] -= 2.0 * growth[e] * u[r] * u[c]
 
 
 @kernel
@@ -132,10 +160,14 @@ def tether_blocks(x, anchor, tethers, m, block):
     """Add the Hessian of the first `m` tethers and their shear layer, both positive, to the symmetric `block` (n, 6)."""
     per = 1.0 / (tethers.s0 * tethers.s0)
     for i in range(m):
-        k = 0.0
         for e in range(tethers.start[i], tethers.start[i + 1]):
-            k += tethers.shear[e]
-        add_identity(block, i, k)
+            j = tethers.neighbour[e]
+            ux = x[i, 0] - anchor[i, 0] - x[j, 0] + anchor[j, 0]
+            uy = x[i, 1] - anchor[i, 1] - x[j, 1] + anchor[j, 1]
+            uz = x[i, 2] - anchor[i, 2] - x[j, 2] + anchor[j, 2]
+            grow = tethers.shear_growth[e]
+            add_identity(block, i, tethers.shear[e] + grow * (ux * ux + uy * uy + uz * uz))
+            add_outer(block, i, 2.0 * grow, ux, uy, uz)
         k = tethers.stiffness[i]
         if k > 0.0:
             dx = x[i, 0] - anchor[i, 0]

@@ -13,6 +13,10 @@ import math
 from faceanim.ground.jit import kernel
 from faceanim.kernels.linalg3 import add_outer
 
+STEEPEST = math.sqrt(3.0)
+"""No trilinear interpolation of distances grows faster than this."""
+OFF_GRID = 4.0
+"""A vertex off a bone's grid counts as so far away [mm] when it is asked whether it may have come back."""
 DEEPEST = 2.5
 """A vertex farther behind the other lip than this [mm] belongs to something else."""
 
@@ -108,21 +112,25 @@ def closest_on_triangle(x, i, a, b, c):
     return distance, 1.0 - s - t, s, t
 
 
-@kernel
-def triangle_side(x, i, a, b, c, wa, wb, wc):
-    """Return the vector from the point (wa, wb, wc) of triangle (a, b, c) to vertex `i`, and how far in front it is.
-
-    (dx, dy, dz, s, nx, ny, nz): n is the triangle's unit normal, s = n . d.
-    """
+@kernel(inline=True)
+def cross_of(x, a, b, c):
+    """Return the normal of triangle (a, b, c), twice its area long."""
     ux = x[b, 0] - x[a, 0]
     uy = x[b, 1] - x[a, 1]
     uz = x[b, 2] - x[a, 2]
     vx = x[c, 0] - x[a, 0]
     vy = x[c, 1] - x[a, 1]
     vz = x[c, 2] - x[a, 2]
-    nx = uy * vz - uz * vy
-    ny = uz * vx - ux * vz
-    nz = ux * vy - uy * vx
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@kernel
+def triangle_side(x, i, a, b, c, wa, wb, wc):
+    """Return the vector from the point (wa, wb, wc) of triangle (a, b, c) to vertex `i`, and how far in front it is.
+
+    (dx, dy, dz, s, nx, ny, nz): n is the triangle's unit normal, s = n . d.
+    """
+    nx, ny, nz = cross_of(x, a, b, c)
     length = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nx *= length
     ny *= length
@@ -134,22 +142,54 @@ def triangle_side(x, i, a, b, c, wa, wb, wc):
 
 
 @kernel
-def signed_gap(x, i, a, b, c, wa, wb, wc):
+def signed_gap(x, looks, i, a, b, c, wa, wb, wc):
     """Return the signed distance of vertex `i` from the point (wa, wb, wc) of triangle (a, b, c), and its direction.
 
-    Positive in front of the triangle. A vertex that is behind the plane but rather beside the triangle than behind it
-    has left the sheet over its border, and one deeper than `DEEPEST` is no contact: a huge distance is returned.
+    Positive in front. The sheet looks where its vertex normals `looks` (n, 3), interpolated, look: a vertex that slides
+    over an edge feels no jump, and one on the plane of symmetry no push to the side. A vertex that is behind but rather
+    beside the triangle than behind it has left the sheet over its border, and one deeper than `DEEPEST` is no contact:
+    a huge distance is returned. One that is in front but rather beside is as far as the point is.
     """
-    dx, dy, dz, s, nx, ny, nz = triangle_side(x, i, a, b, c, wa, wb, wc)
+    nx = wa * looks[a, 0] + wb * looks[b, 0] + wc * looks[c, 0]
+    ny = wa * looks[a, 1] + wb * looks[b, 1] + wc * looks[c, 1]
+    nz = wa * looks[a, 2] + wb * looks[b, 2] + wc * looks[c, 2]
+    length = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx *= length
+    ny *= length
+    nz *= length
+    dx = x[i, 0] - wa * x[a, 0] - wb * x[b, 0] - wc * x[c, 0]
+    dy = x[i, 1] - wa * x[a, 1] - wb * x[b, 1] - wc * x[c, 1]
+    dz = x[i, 2] - wa * x[a, 2] - wb * x[b, 2] - wc * x[c, 2]
+    s = nx * dx + ny * dy + nz * dz
     r2 = dx * dx + dy * dy + dz * dz
+    if r2 <= 2.0 * s * s or r2 < 1e-12:
+        return 1e30 if s < -DEEPEST else s, nx, ny, nz
     if s < 0.0:
-        if r2 > 2.0 * s * s or s < -DEEPEST:
-            return 1e30, nx, ny, nz
-        return s, nx, ny, nz
+        return 1e30, nx, ny, nz
     r = math.sqrt(r2)
-    if r < 1e-6:
-        return s, nx, ny, nz
     return r, dx / r, dy / r, dz / r
+
+
+@kernel
+def vertex_normals(x, corners, looks):
+    """Write the unit normals of the vertices of `corners` (t, 3), as far as these triangles go, into `looks` (n, 3)."""
+    for t in range(len(corners)):
+        for k in range(3):
+            looks[corners[t, k], 0] = 0.0
+            looks[corners[t, k], 1] = 0.0
+            looks[corners[t, k], 2] = 0.0
+    for t in range(len(corners)):
+        nx, ny, nz = cross_of(x, corners[t, 0], corners[t, 1], corners[t, 2])
+        for k in range(3):
+            looks[corners[t, k], 0] += nx
+            looks[corners[t, k], 1] += ny
+            looks[corners[t, k], 2] += nz
+    for t in range(len(corners)):
+        for k in range(3):
+            i = corners[t, k]
+            length = 1.0 / math.sqrt(looks[i, 0] ** 2 + looks[i, 1] ** 2 + looks[i, 2] ** 2 + 1e-300)
+            for d in range(3):
+                looks[i, d] *= length
 
 
 @kernel(inline=True)
@@ -166,7 +206,10 @@ def put_plane(planes, count, i, nx, ny, nz, offset, stiffness):
 
 @kernel
 def find_bones(x, colliders, grids, pose, reach, count, planes):
-    """Add the planes of vertices nearer than clearance + `reach` [mm] to a bone; return the new count."""
+    """Add the planes of vertices nearer than clearance + `reach` [mm] to a bone; return the new count.
+
+    A vertex whose distance cannot have shrunk to that since it was last measured is passed over.
+    """
     for c in range(len(colliders.bone_node)):
         b = colliders.bone[c]
         if grids.offset[b] < 0:
@@ -178,7 +221,18 @@ def find_bones(x, colliders, grids, pose, reach, count, planes):
         px = pose[b, 0, 0] * dx + pose[b, 1, 0] * dy + pose[b, 2, 0] * dz
         py = pose[b, 0, 1] * dx + pose[b, 1, 1] * dy + pose[b, 2, 1] * dz
         pz = pose[b, 0, 2] * dx + pose[b, 1, 2] * dy + pose[b, 2, 2] * dz
+        seen = planes.seen[c]
+        ux = px - seen[0]
+        uy = py - seen[1]
+        uz = pz - seen[2]
+        spare = (seen[3] - colliders.bone_clearance[c] - reach) / STEEPEST
+        if spare > 0.0 and ux * ux + uy * uy + uz * uz < spare * spare:
+            continue
         d, gx, gy, gz = sample_grid(grids, b, px, py, pz)
+        seen[0] = px
+        seen[1] = py
+        seen[2] = pz
+        seen[3] = min(d, OFF_GRID)
         gap = d - colliders.bone_clearance[c]
         if gap < reach:
             nx = pose[b, 0, 0] * gx + pose[b, 0, 1] * gy + pose[b, 0, 2] * gz
@@ -266,15 +320,16 @@ def nearest_triangle(x, i, colliders, c, guess, ball):
 
 
 @kernel
-def pair_gaps(x, colliders, ball, gap):
+def pair_gaps(x, colliders, ball, looks, gap):
     """Write the signed distance of each pair contact's vertex from the other side into `gap` (cp,) [mm]."""
     corner = colliders.corners
     bound_triangles(x, corner, ball)
+    vertex_normals(x, corner, looks)
     for c in range(len(colliders.pair_node)):
         i = colliders.pair_node[c]
         first = colliders.pair_triangle[colliders.pair_start[c]]
         t, wa, wb, wc, _ = nearest_triangle(x, i, colliders, c, first, ball)
-        gap[c], _, _, _ = signed_gap(x, i, corner[t, 0], corner[t, 1], corner[t, 2], wa, wb, wc)
+        gap[c], _, _, _ = signed_gap(x, looks, i, corner[t, 0], corner[t, 1], corner[t, 2], wa, wb, wc)
 
 
 @kernel
@@ -321,6 +376,7 @@ def find_pairs(x, colliders, reach, count, planes):
         return count
     moved = 2.0 * farthest_move(x, planes.before, colliders)
     bound_triangles(x, colliders.corners, planes.ball)
+    vertex_normals(x, colliders.corners, planes.looks)
     for c in range(len(colliders.pair_node)):
         planes.apart[c] -= moved
         if planes.apart[c] > colliders.pair_gap[c] + reach:
@@ -332,7 +388,7 @@ def find_pairs(x, colliders, reach, count, planes):
         j = colliders.corners[t, 0]
         k = colliders.corners[t, 1]
         l = colliders.corners[t, 2]
-        d, nx, ny, nz = signed_gap(x, i, j, k, l, wa, wb, wc)
+        d, nx, ny, nz = signed_gap(x, planes.looks, i, j, k, l, wa, wb, wc)
         gap = d - colliders.pair_gap[c]
         if gap < reach:
             # The offset makes the plane's gap the true one here, also where the nearest point lies on a side.

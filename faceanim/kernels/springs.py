@@ -40,7 +40,7 @@ _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8, _S9, _S10, _S11 = STORE[:12]
 class ForceScratch(NamedTuple):
     """Work space of the force kernels for one block of triangles.
 
-    corner : (3, BLOCK, 3) the corners A, B, C [mm], flat
+    corner : (6, BLOCK, 3) the corners A, B, C [mm] and, for `skin_force`, their displacements, flat
     result : (3, BLOCK, 4) force [mN] and stiffness [mN/mm] of the corners, flat; for `elastic_gradient_blocks` the
         nine numbers of each corner as (3, BLOCK, 4), (3, BLOCK, 4), (3, BLOCK)
     """
@@ -57,7 +57,7 @@ def _aligned(size: int) -> NDArray[np.float64]:
 
 def force_scratch(springs: Springs) -> ForceScratch:
     """Return work space for the force kernels on `springs`; not to be shared between threads."""
-    return ForceScratch(_aligned(9 * BLOCK), _aligned(27 * BLOCK))
+    return ForceScratch(_aligned(18 * BLOCK), _aligned(27 * BLOCK))
 
 
 @kernel(inline=True)

@@ -56,8 +56,8 @@ class Tethers(NamedTuple):
 
     rest : (n, 3) [mm]   bone_weight : (n, n_bone) [-], rows sum to 1   stiffness : (n,) [mN/mm]
     alpha [-], s0 [mm] : growth of the stiffness, as in `Law`
-    The shear layer ties the displacements of neighbours: rows start[i]..start[i + 1] of `neighbour` and `shear` [mN/mm]
-    shear_sum : (n,) sum of each vertex's shear [mN/mm]
+    The shear layer ties the displacements of neighbours: rows start[i]..start[i + 1] of `neighbour`,
+    `shear` [mN/mm] and `shear_growth` [mN/mm^3]
     """
 
     rest: F8
@@ -68,7 +68,17 @@ class Tethers(NamedTuple):
     start: I4
     neighbour: I4
     shear: F8
-    shear_sum: F8
+    shear_growth: F8
+
+
+class Layer(NamedTuple):
+    """The shear layer by triangle, for vector loops; `Tethers` has the same by vertex.
+
+    shear [mN/mm], growth [mN/mm^3] : (3, t) this triangle's share for the edge opposite each corner
+    """
+
+    shear: F8
+    growth: F8
 
 
 class Fibres(NamedTuple):
@@ -137,6 +147,7 @@ class Planes(NamedTuple):
     What the search for pair contacts remembers from call to call, none of which changes what it finds:
     nearest : (cp,) the triangle nearest to each vertex last time   apart : (cp,) lower bound of the distance [mm]
     before : (n, 3) positions at the last call   ball : (t, 4) bounding spheres of the triangles
+    looks : (n, 3) vertex normals of the sheets   seen : (cb, 4) place in the bone's frame and distance, last time
     """
 
     count: I4  # type: ignore[assignment]
@@ -149,6 +160,8 @@ class Planes(NamedTuple):
     apart: F8
     before: F8
     ball: F8
+    looks: F8
+    seen: F8
 
 
 class Scene(NamedTuple):
@@ -156,6 +169,7 @@ class Scene(NamedTuple):
 
     free: int
     springs: Springs
+    layer: Layer
     law: Law
     tethers: Tethers
     fibres: Fibres
@@ -180,6 +194,23 @@ class Moment(NamedTuple):
     softening: F8
     planes: Planes
     shift: F8
+
+
+class Factor(NamedTuple):
+    """A sparse lower triangular matrix L in rows of its own order, and its transpose, without their diagonals.
+
+    order : (n,) vertex of each row   inverse_diagonal : (n,)
+    lower_start : (n + 1,)   lower_column, lower : (e,) rows of L   upper_start, upper_column, upper : those of L^T
+    """
+
+    order: I4
+    inverse_diagonal: F8
+    lower_start: I4
+    lower_column: I4
+    lower: F8
+    upper_start: I4
+    upper_column: I4
+    upper: F8
 
 
 class Drive(NamedTuple):

@@ -16,7 +16,7 @@ class SpringLaw:
     beta : repulsion strength factor [-] (Eq. 14)
     zeta : repulsion force scale [-] as a fraction of (stiffness * rest height), so that it has no hidden unit
     uniform_k0 : one stiffness [mN/mm] for every spring, as in the paper's Fig. 2; None = from the membrane modulus
-    height_ratio : stiffness of an edge repulsion spring over that of the mean edge of its triangle [-]
+    height_ratio : stiffness of an edge repulsion spring over that of an edge in an equilateral mesh of its height [-]
     reaction : whether an edge repulsion spring pushes back on its edge (exact gradient of an energy); the paper: False
     """
 

@@ -23,7 +23,7 @@ LINEAR = SpringLaw(alpha=0.0, zeta=0.0, height_ratio=0.0)
 def soft_sheet() -> Body:
     """Return a heavy, soft, lightly damped sheet without contact, whose motion is smooth in time."""
     body = held_sheet(8, 8, colliders=False, force=150.0, damping=20.0)
-    return replace(body, mass=body.mass * 30.0, attachment=replace(body.attachment, s0=20.0))
+    return replace(body, mass=body.mass * 30.0, attachment=replace(body.attachment, s0=20.0, shear=None))
 
 
 def played(body: Body, h: float, end: float, **options: Any) -> np.ndarray:

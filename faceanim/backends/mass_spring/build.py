@@ -11,9 +11,9 @@ from faceanim.geometry import topology
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 from faceanim.kernels import contact
-from faceanim.kernels.tables import BoneGrids, Colliders, Fibres, Law, Planes, Scene, Springs, Tethers
+from faceanim.kernels.tables import BoneGrids, Colliders, Fibres, Law, Layer, Planes, Scene, Springs, Tethers
 
-STIFFENING = 0.5
+STIFFENING = 0.2
 """Depth at which the stiffness of a contact has grown fourfold [mm]."""
 
 
@@ -23,7 +23,7 @@ class Patch:
 
     nodes : (n,) body vertex of each   m : how many are free   held : (n,) those carried by the bones
     mass : (n,) [kg]   edge_of : (3, t) edge opposite each corner   pairs : (e, 2) vertices of each edge, smaller first;
-    the first `n_pair` edges join free vertices   shear : (e,) of the layer beneath [mN/mm]   scene : kernel tables
+    the first `n_pair` edges join free vertices   shear : (e, 2) of the layer beneath [mN/mm] and its growth [mN/mm^3]   scene : kernel tables
     muscles : how many the body has
     """
 
@@ -54,7 +54,8 @@ class Tables:
     """Everything about a body that does not depend on which vertices are free.
 
     Springs carry their triangle's share: an edge gets Y * area / d^2 from each of its triangles (Van Gelder), or
-    uniform_k0 in all; a repulsion spring gets height_ratio times the mean full stiffness of its triangle's edges.
+    uniform_k0 in all; a repulsion spring gets height_ratio times what an edge would get in an
+    equilateral mesh of that height, 2 Y * area / (4/3 h^2): a sliver's long height must not be as stiff as its short side.
     """
 
     def __init__(self, body: Body) -> None:
@@ -63,7 +64,7 @@ class Tables:
         self.law = Law(float(law.alpha), float(law.s0), float(law.beta), int(law.reaction))
         self.edges, self.edge_of = topology.edge_of_corner(body.surface.triangles)
         self._springs()
-        self.shear = self._shear_layer()
+        self._shear_layer()
         self.grids = bone_grids(body)
         self._rest_gaps()
 
@@ -77,36 +78,43 @@ class Tables:
             self.edge_share = (body.membrane_modulus * body.surface.areas)[:, None] / self.edge_length**2
         else:
             self.edge_share = law.uniform_k0 / count[self.edge_of]
-        full = np.bincount(self.edge_of.ravel(), weights=self.edge_share.ravel(), minlength=len(self.edges))
         self.height = body.surface.heights
-        mean = full[self.edge_of].mean(axis=1, keepdims=True)
-        self.height_stiffness = law.height_ratio * np.repeat(mean, 3, axis=1)
+        if law.uniform_k0 is None:
+            like_edge = 1.5 * (body.membrane_modulus * body.surface.areas)[:, None] / self.height**2
+        else:
+            like_edge = np.full_like(self.height, law.uniform_k0)
+        self.height_stiffness = law.height_ratio * like_edge
         self.repulsion = law.zeta * self.height_stiffness * self.height
         self.triangles = triangles
 
-    def _shear_layer(self) -> Floats:
-        """Return what the shear layer adds to each edge, (e,) [mN/mm]: cotangent weights, none negative."""
+    def _shear_layer(self) -> None:
+        """Compute what the shear layer adds to each edge: stiffness w [mN/mm] and growth w / (limit length)^2.
+
+        `layer_share` (t, 3), `layer_growth` (t, 3) by triangle, `shear` (e, 2) in all.
+        Cotangent weights, none negative: they sum to the integral of |grad u|^2.
+        """
         body = self.body
+        self.shear: Floats = np.zeros((len(self.edges), 2))
+        self.layer_share, self.layer_growth = np.zeros((2, *self.edge_of.shape))
         if body.attachment.shear is None:
-            return np.zeros(len(self.edges))
+            return
         corner = body.surface.points[body.surface.triangles]
         left, right = np.roll(corner, -1, axis=1) - corner, np.roll(corner, -2, axis=1) - corner
         cotangent = (left * right).sum(axis=2) / (2.0 * body.surface.areas[:, None])
-        weight = 0.5 * body.attachment.shear[:, None] * np.clip(cotangent, 0.0, 10.0)
-        total: Floats = np.zeros(len(self.edges))
-        np.add.at(total, self.edge_of.ravel(), weight.ravel())
-        return total
+        self.layer_share = 0.5 * body.attachment.shear[:, None] * np.clip(cotangent, 0.0, 10.0)
+        if body.attachment.shear_limit is not None:
+            self.layer_growth = self.layer_share / (body.attachment.shear_limit[:, None] * self.edge_length) ** 2
+        for k, share in enumerate((self.layer_share, self.layer_growth)):
+            np.add.at(self.shear[:, k], self.edge_of.ravel(), share.ravel())
 
     def _local_shear(self, local: Ints, n: int) -> tuple[Ints, Ints, Floats, Floats]:
-        """Return start, neighbour, stiffness and its sums of the shear layer's ties between the `n` vertices of a patch."""
-        keep = (local[self.edges] >= 0).all(axis=1) & (self.shear > 0.0)
+        """Return start, neighbour, stiffness and growth of the shear layer's ties between the `n` vertices of a patch."""
+        keep = (local[self.edges] >= 0).all(axis=1) & (self.shear[:, 0] > 0.0)
         pairs, shear = local[self.edges[keep]], self.shear[keep]
         lists = topology.grouped(pairs.T.ravel(), np.arange(2 * len(pairs), dtype=np.int32), n)
         other = pairs[:, ::-1].T.ravel()[lists.item]
-        both = np.tile(shear, 2)[lists.item]
-        total: Floats = np.zeros(n)
-        np.add.at(total, pairs.T.ravel(), np.tile(shear, 2))
-        return lists.start, np.ascontiguousarray(other, dtype=np.int32), both, total
+        stiffness, growth = np.ascontiguousarray(np.tile(shear.T, 2)[:, lists.item])
+        return lists.start, np.ascontiguousarray(other, dtype=np.int32), stiffness, growth
 
     def _rest_gaps(self) -> None:
         """Shrink each clearance to the gap at rest, so that a body at rest feels no contact."""
@@ -129,7 +137,7 @@ class Tables:
             self.triangles, float(body.contact_stiffness), STIFFENING,
         )  # fmt: skip
         at_rest = np.zeros(len(pair_node))
-        contact.pair_gaps(x, self.colliders, np.zeros((len(self.triangles), 4)), at_rest)
+        contact.pair_gaps(x, self.colliders, np.zeros((len(self.triangles), 4)), np.zeros_like(x), at_rest)
         np.minimum(pair_gap, at_rest, out=pair_gap)
 
     def patch(self, free: Ints) -> Patch:
@@ -148,7 +156,7 @@ class Tables:
         nodes = np.concatenate([free, around[~is_free[around]]]).astype(np.int32)
         local = np.full(n, -1, dtype=np.int32)
         local[nodes] = np.arange(len(nodes), dtype=np.int32)
-        springs, edge_of, pairs, n_pair = self._local_springs(
+        springs, layer, edge_of, pairs, n_pair = self._local_springs(
             np.flatnonzero(used).astype(np.int32), local, len(nodes), len(free)
         )
         body = self.body
@@ -159,7 +167,7 @@ class Tables:
         )  # fmt: skip
         fibres = _local_fibres(body, local, len(free), len(nodes))
         colliders = self._local_colliders(is_free, local, rows, touched)
-        scene = Scene(len(free), springs, self.law, tethers, fibres, colliders, self.grids)
+        scene = Scene(len(free), springs, layer, self.law, tethers, fibres, colliders, self.grids)
         shear = self.shear[_rows_of(self.edges, nodes[pairs])]
         return Patch(
             nodes, len(free), body.pinned[nodes], body.mass[nodes], edge_of, pairs, n_pair, shear, scene,
@@ -175,7 +183,7 @@ class Tables:
         acts = any_free[c.pair_start[1:]] > any_free[c.pair_start[:-1]]
         return np.flatnonzero(is_free[c.pair_node] | acts).astype(np.int32)
 
-    def _local_springs(self, used: Ints, local: Ints, n: int, m: int) -> tuple[Springs, Ints, Ints, int]:
+    def _local_springs(self, used: Ints, local: Ints, n: int, m: int) -> tuple[Springs, Layer, Ints, Ints, int]:
         corners = local[self.triangles[used]]
         a, b, c = (np.ascontiguousarray(corners[:, k]) for k in range(3))
         slots = np.arange(3 * len(used), dtype=np.int32)
@@ -193,7 +201,14 @@ class Tables:
         order = np.concatenate([np.flatnonzero(inner), np.flatnonzero(~inner)])
         place = np.empty(len(order), dtype=np.int32)
         place[order] = np.arange(len(order), dtype=np.int32)
-        return springs, np.ascontiguousarray(place[edge_of].T), np.ascontiguousarray(pairs[order]), int(inner.sum())
+        layer = Layer(table(self.layer_share), table(self.layer_growth))
+        return (
+            springs,
+            layer,
+            np.ascontiguousarray(place[edge_of].T),
+            np.ascontiguousarray(pairs[order]),
+            int(inner.sum()),
+        )
 
     def _local_colliders(self, is_free: Bools, local: Ints, rows: Ints, touched: Ints) -> Colliders:
         c = self.colliders
@@ -225,7 +240,8 @@ def room_for_planes(colliders: Colliders, n: int) -> Planes:
     return Planes(
         np.zeros(1, dtype=np.int32), np.full((size, 4), -1, dtype=np.int32), np.zeros((size, 3)), np.zeros((size, 3)),
         np.zeros(size), np.zeros(size), colliders.pair_triangle[colliders.pair_start[:-1]].copy(), np.zeros(pairs),
-        np.zeros((n, 3)), np.zeros((len(colliders.corners), 4)),
+        np.zeros((n, 3)), np.zeros((len(colliders.corners), 4)), np.zeros((n, 3)),
+        np.zeros((len(colliders.bone_node), 4)),
     )  # fmt: skip
 
 

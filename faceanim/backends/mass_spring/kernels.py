@@ -12,11 +12,18 @@ import math
 import numpy as np
 
 from faceanim.ground.jit import kernel
-from faceanim.kernels.attachment import carry, find_shift, growth, tether_force, tie
+from faceanim.kernels.attachment import carry, find_shift, growth, tether_force, tether_pull, tie
 from faceanim.kernels.contact import find, penalty, plane_force, plane_gap
 from faceanim.kernels.muscles import aim, fibre_force, pull_of
+from faceanim.kernels.skin import skin_force
 from faceanim.kernels.springs import elastic_force
 from faceanim.kernels.tangent import height_terms
+from faceanim.kernels.triangular import solve_factored
+
+FIRST_STEP = 0.5
+"""Trial length of the first conjugate gradient step, in preconditioned directions: about one over the stiffest."""
+LONGEST_STEP = 5.0
+"""No conjugate gradient step moves a vertex farther [mm]."""
 
 
 @kernel
@@ -183,6 +190,112 @@ def sweep_moves(x, scene, moment, weight, centre, force, keep, gain, move):
         move[i, 1] = keep * move[i, 1] + s * fy
         move[i, 2] = keep * move[i, 2] + s * fz
     return residual, wish
+
+
+@kernel
+def residual_force(x, scene, moment, scratch, weight, centre, force, residual):
+    """Write F(x) - w (x - c) of the free vertices into `residual` (m, 3); `force` (n, 4) is work, `moment.shift` known."""
+    skin_force(x, moment.shift, scene.springs, scene.layer, scene.law, scratch, force)
+    plane_force(x, moment.planes, scene.colliders.stiffening, force)
+    for i in range(scene.free):
+        fx, fy, fz = tether_pull(moment.shift, i, scene.tethers)
+        px = x[i, 0]
+        py = x[i, 1]
+        pz = x[i, 2]
+        for e in range(moment.first[i], moment.first[i + 1]):
+            ux, uy, uz, _ = pull_of(e, px, py, pz, moment)
+            fx += ux
+            fy += uy
+            fz += uz
+        w = weight[i]
+        residual[i, 0] = fx + force[i, 0] - w * (px - centre[i, 0])
+        residual[i, 1] = fy + force[i, 1] - w * (py - centre[i, 1])
+        residual[i, 2] = fz + force[i, 2] - w * (pz - centre[i, 2])
+
+
+@kernel
+def dot(a, b):
+    """Return the scalar product of `a` and `b` (m, 3)."""
+    one = a.reshape(a.size)
+    other = b.reshape(b.size)
+    total = 0.0
+    for i in range(one.size):
+        total += one[i] * other[i]
+    return total
+
+
+@kernel
+def go(x, shift, step, direction):
+    """Move the free vertices of `x` and `shift` (n, 3) by `step` times `direction` (m, 3)."""
+    for i in range(len(direction)):
+        for d in range(3):
+            x[i, d] += step * direction[i, d]
+            shift[i, d] += step * direction[i, d]
+
+
+@kernel
+def longest(a):
+    """Return the largest norm of a row of `a` (m, 3)."""
+    worst = 0.0
+    for i in range(len(a)):
+        worst = max(worst, a[i, 0] ** 2 + a[i, 1] ** 2 + a[i, 2] ** 2)
+    return math.sqrt(worst)
+
+
+@kernel
+def conjugate_gradient(
+    x, scene, moment, scratch, weight, centre, factor, most, tolerance, reach, pair_reach, force, work
+):
+    """Preconditioned nonlinear conjugate gradients (Polak-Ribiere, never negative) on w (x - c) = F(x), in place.
+
+    Each iteration evaluates the forces once, a trial step ahead; the curvature met on the way gives the step's length,
+    and the residual there follows by the same secant.
+    factor : `tables.Factor`   most : iterations   tolerance : stop when one moves no vertex farther [mm]
+    force : (n, 4), work : `Iterates`   reach, pair_reach : of the contacts, found anew halfway if vertices may have
+    used up half of it
+    Returns (iterations, largest residual [mN], longest move of the last [mm]).
+    """
+    residual, before, trial, z, direction, half = work
+    find_shift(x, moment.anchor, moment.shift)
+    residual_force(x, scene, moment, scratch, weight, centre, force, residual)
+    step = FIRST_STEP
+    rz_before = 0.0
+    travel = 0.0
+    move = 0.0
+    direction[:] = 0.0
+    for k in range(most):
+        solve_factored(factor, residual, half, z)
+        rz = dot(residual, z)
+        keep = max(0.0, (rz - dot(before, z)) / rz_before) if rz_before > 0.0 else 0.0
+        for i in range(scene.free):
+            for d in range(3):
+                direction[i, d] = z[i, d] + keep * direction[i, d]
+        rz_before = rz
+        slope = dot(residual, direction)
+        far = longest(direction)
+        if not far > 0.0:
+            return k, 0.0, 0.0
+        guess = min(step, LONGEST_STEP / far)
+        go(x, moment.shift, guess, direction)
+        residual_force(x, scene, moment, scratch, weight, centre, force, trial)
+        bend = slope - dot(trial, direction)
+        step = guess * min(4.0, slope / bend) if bend > 0.25 * slope else 4.0 * guess
+        step = min(step, LONGEST_STEP / far)
+        go(x, moment.shift, step - guess, direction)
+        share = step / guess
+        for i in range(scene.free):
+            for d in range(3):
+                before[i, d] = residual[i, d]
+                residual[i, d] += share * (trial[i, d] - residual[i, d])
+        move = step * far
+        travel += move
+        if move < tolerance:
+            return k + 1, longest(residual), move
+        if k == most // 2 and travel > 0.5 * pair_reach:
+            find(x, scene.colliders, scene.grids, moment.pose, reach, pair_reach, moment.planes)
+            residual_force(x, scene, moment, scratch, weight, centre, force, residual)
+            rz_before = 0.0
+    return most, longest(residual), move
 
 
 @kernel(inline=True)

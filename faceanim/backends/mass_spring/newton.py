@@ -180,7 +180,9 @@ class Newton:
         tangent.spring_matrix(
             x, patch.scene.springs, patch.scene.law, patch.edge_of, int(exact), self.diagonal, self.coupling
         )
-        attachment.shear_coupling(patch.shear, len(patch.shear), self.coupling)
+        attachment.shear_coupling(
+            x, load.moment.anchor, patch.pairs, patch.shear[:, 0], patch.shear[:, 1], self.coupling
+        )
         soft = SOFTEST * float(self.diagonal[: patch.m, [0, 3, 5]].mean()) if patch.m else 0.0
         contact.plane_tangent(x, load.moment.planes, patch.scene.colliders.stiffening, self.tangent)
         tangent.spring_blocks(x, patch.scene.springs, patch.scene.law, 0, self.metric)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from faceanim.ground.errors import UserError, unknown_name
 
-SCHEMES = ("paper", "semi_implicit", "block_descent", "explicit", "newton")
+SCHEMES = ("paper", "semi_implicit", "conjugate_gradient", "block_descent", "explicit", "newton")
 INTEGRATORS = ("bdf2", "euler")
 QUASI_STATIC = ("integrated", "chebyshev", "waves")
 
@@ -15,11 +15,14 @@ QUASI_STATIC = ("integrated", "chebyshev", "waves")
 class Options:
     """How the skin is moved in time.
 
-    scheme : "block_descent" implicit steps by block sweeps (the default: right in time, stable, fast);
+    scheme : "conjugate_gradient" implicit steps by preconditioned conjugate gradients (the default: right in time,
+        stable, fast); "block_descent" the same steps by accelerated sweeps over the vertices, without set-up;
         "newton" the same steps solved to the end, the yardstick; "explicit" leapfrog with automatic substeps;
         "semi_implicit" and "paper" the per-node implicit steps of Zhang, Prakash & Sung (Eqs. 18-19), corrected and
         as printed: relaxers rather than integrators, see the stability atlas
-    integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), for block_descent and newton
+    integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), for conjugate_gradient, block_descent and newton
+    iterations : most conjugate gradient iterations in a step
+    iteration_tolerance : they stop when one moves no vertex farther [mm]
     sweeps : passes of block_descent over the vertices in a step
     adaptive : integrate only near the muscles that act and relax the rest quasi-statically (section 4 of the paper)
     tolerance : what the adaptive partition may cost in accuracy [mm]
@@ -33,8 +36,10 @@ class Options:
     newton_most : cap of Newton steps
     """
 
-    scheme: str = "block_descent"
+    scheme: str = "conjugate_gradient"
     integrator: str = "euler"
+    iterations: int = 8
+    iteration_tolerance: float = 1e-3
     sweeps: int = 20
     adaptive: bool = False
     tolerance: float = 0.05
@@ -54,9 +59,9 @@ class Options:
         ):
             if value not in known:
                 raise unknown_name(kind, value, known)
-        for name in ("sweeps", "passes", "newton_most"):
+        for name in ("iterations", "sweeps", "passes", "newton_most"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} = {getattr(self, name)} must be at least 1")
-        for name in ("tolerance", "newton_tolerance", "sweep_tolerance", "safety"):
+        for name in ("tolerance", "newton_tolerance", "iteration_tolerance", "sweep_tolerance", "safety"):
             if not getattr(self, name) > 0:
                 raise UserError(f"{name} = {getattr(self, name)} must be positive")

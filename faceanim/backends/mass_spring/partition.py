@@ -136,6 +136,7 @@ def content_key(body: Body, controls: Sequence[Control], tolerance: float) -> st
     for array in (
         s.points, s.triangles, body.mass, body.membrane_modulus, body.pinned, a.bone_weight, a.stiffness, u.max_force,
         u.muscle, u.node, u.weight, u.kind, u.point, u.bone, u.softening,
+        *(array for array in (a.shear, a.shear_limit) if array is not None),
     ):  # fmt: skip
         digest.update(np.ascontiguousarray(array).tobytes())
     for bone in body.bones:

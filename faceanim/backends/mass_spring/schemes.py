@@ -10,13 +10,19 @@ from faceanim.backends.mass_spring import kernels
 from faceanim.backends.mass_spring.load import Load
 from faceanim.backends.mass_spring.newton import Newton
 from faceanim.backends.mass_spring.options import Options
+from faceanim.backends.mass_spring.preconditioner import (
+    contact_stiffness,
+    elimination_order,
+    incomplete_factor,
+    scalar_stiffness,
+)
 from faceanim.backends.solver import StepReport
 from faceanim.ground.arrays import Floats
-from faceanim.kernels.tables import Drive
+from faceanim.kernels.tables import Drive, Factor
 
 REACH = 1.5
 """Contacts within this distance [mm] of their clearance are watched during a step."""
-PAIR_REACH = 0.3
+PAIR_REACH = 1.0
 """The same for lips and lids, whose search is the dearest."""
 HIGHEST = 2.0
 """No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
@@ -26,6 +32,10 @@ RESOLVED = 1.5
 """n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
 SETTLED = 0.02
 """A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
+CONTACT_SHARE = 0.5
+CONTACT_NEAR = 1.0
+MOST_FACTORS = 4
+"""Factors are kept for so many different time steps."""
 MOST_SUBSTEPS = 100_000
 """Leapfrog gives up (as diverged) when a step asks for more."""
 OMEGA = 1.5
@@ -126,6 +136,35 @@ class BlockDescent(_Implicit):
         report.iterations += sweeps
         report.residual = max(report.residual, residual)
         report.converged = report.converged and wish < SETTLED
+
+
+class ConjugateGradient(_Implicit):
+    """Implicit step by a few nonlinear conjugate gradient iterations, preconditioned with the stiffness at rest."""
+
+    def __init__(self, load: Load, drag: float, options: Options) -> None:
+        super().__init__(load, drag, options)
+        m = load.patch.m
+        self.work = (*(np.zeros((m, 3)) for _ in range(5)), np.zeros((m, 4)))
+        self.stiffness = scalar_stiffness(load)
+        self.touching = CONTACT_SHARE * contact_stiffness(load, CONTACT_NEAR)
+        self.order = elimination_order(self.stiffness, load.patch.scene.tethers.rest[:m])
+        self.factors: dict[float, Factor] = {}
+
+    def _minimise(self, gamma: float, report: StepReport) -> None:
+        load, options = self.load, self.options
+        if gamma not in self.factors:
+            if len(self.factors) > MOST_FACTORS:
+                self.factors.clear()
+            self.factors[gamma] = incomplete_factor(
+                self.stiffness, self.order, self.touching + self.weight[: load.patch.m]
+            )
+        iterations, residual, move = kernels.conjugate_gradient(
+            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self.factors[gamma],
+            options.iterations, options.iteration_tolerance, REACH, PAIR_REACH, load.force, self.work,
+        )  # fmt: skip
+        report.iterations += iterations
+        report.residual = max(report.residual, residual)
+        report.converged = report.converged and move < SETTLED
 
 
 class QuasiStatic(_Patchwise):
@@ -267,9 +306,13 @@ class Explicit(_Patchwise):
         return float(kernels.largest_substep(patch.scene, patch.mass, self.drag, 1.0, self.options.safety, force))
 
 
-SCHEMES: dict[str, type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | type[Paper] | type[Explicit]] = {
+SCHEMES: dict[
+    str,
+    type[ConjugateGradient] | type[BlockDescent] | type[FullNewton] | type[SemiImplicit] | type[Paper] | type[Explicit],
+] = {
     "paper": Paper,
     "semi_implicit": SemiImplicit,
+    "conjugate_gradient": ConjugateGradient,
     "block_descent": BlockDescent,
     "explicit": Explicit,
     "newton": FullNewton,

@@ -1,0 +1,123 @@
+"""An incomplete Cholesky factor of a patch's stiffness at rest, averaged over the directions of space.
+
+The shear layer and the tethers act alike in all directions, and the membrane nearly so, so that one scalar matrix
+stands for the three components. Its Cholesky factor is computed in full and then thinned: entries below `DROPPED` of
+their diagonals go. What is left has five entries a row, is positive definite by construction, and conditions the true
+matrix of a face to about 9 where its diagonal gives 470 (`tools/bench_sweeps.py` measures both).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from faceanim.backends.mass_spring.load import Load
+from faceanim.ground.arrays import Floats, Ints
+from faceanim.kernels import attachment, tangent
+from faceanim.kernels.tables import Factor
+
+DROPPED = 0.03
+"""Entries of the factor below this share of their diagonals (geometric mean) are left out."""
+SOFTEST = 1e-6
+"""Added to the diagonal, as a share of its mean: a vertex that nothing holds has no stiffness."""
+
+
+def scalar_stiffness(load: Load) -> sparse.csr_matrix:
+    """Return the stiffness of the free vertices at rest, a third of the trace of each 3 x 3 block, (m, m) [mN/mm]."""
+    patch, m = load.patch, load.patch.m
+    load.rest()
+    diagonal, coupling = np.zeros((len(patch.nodes), 6)), np.zeros((len(patch.pairs), 9))
+    tangent.spring_matrix(load.x, patch.scene.springs, patch.scene.law, patch.edge_of, 0, diagonal, coupling)
+    anchor = load.moment.anchor
+    attachment.shear_coupling(load.x, anchor, patch.pairs, patch.shear[:, 0], patch.shear[:, 1], coupling)
+    attachment.tether_blocks(load.x, anchor, patch.scene.tethers, m, diagonal)
+    own = diagonal[:m, [0, 3, 5]].sum(axis=1) / 3.0
+    between = coupling[: patch.n_pair, [0, 4, 8]].sum(axis=1) / 3.0
+    i, j = patch.pairs[: patch.n_pair].T
+    k = np.arange(m)
+    rows, columns = np.concatenate([k, i, j]), np.concatenate([k, j, i])
+    return sparse.csr_matrix((np.concatenate([own, between, between]), (rows, columns)), shape=(m, m))
+
+
+def contact_stiffness(load: Load, near: float) -> Floats:
+    """Return the stiffness of the contacts nearer than `near` [mm] at rest as if all touched, (m,) [mN/mm].
+
+    Left out, soft tissue pressed together over a wide patch would be many times stiffer than its preconditioner.
+    """
+    load.rest()
+    load.touch(load.x, near)
+    planes, total = load.moment.planes, np.zeros(len(load.patch.nodes))
+    for c in range(int(planes.count[0])):
+        total[planes.node[c, 0]] += planes.stiffness[c]
+        if planes.node[c, 1] >= 0:
+            np.add.at(total, planes.node[c, 1:], planes.stiffness[c] * planes.weight[c])
+    return total[: load.patch.m]
+
+
+def elimination_order(stiffness: sparse.csr_matrix, points: Floats) -> Ints:
+    """Return the order of elimination: little fill, and the same on both sides of a symmetric patch.
+
+    points : (m, 3) rest positions [mm]. Where the patch is symmetric about x = 0, one side's order is used for both and
+    what lies between them comes last, so that thinning the factor leaves it symmetric.
+    """
+    mirror = _mirror(points)
+    if mirror is None:
+        return _minimum_degree(stiffness)
+    coo = stiffness.tocoo()
+    across = points[coo.row, 0] * points[coo.col, 0] < 0.0
+    between = points[:, 0] == 0.0
+    between[coo.row[across]] = True
+    left = np.flatnonzero((points[:, 0] > 0.0) & ~between)
+    left = left[_minimum_degree(stiffness[left][:, left])]
+    middle = np.flatnonzero(between)
+    middle = middle[_minimum_degree(stiffness[middle][:, middle])]
+    return np.concatenate([left, mirror[left], middle]).astype(np.int32)
+
+
+def _mirror(points: Floats) -> Ints | None:
+    """Return the vertex at the mirror image of each vertex, or None if some image is not a vertex."""
+    if not len(points):
+        return None
+    distance, mirror = cKDTree(points).query(points * [-1.0, 1.0, 1.0])
+    pairs = np.array_equal(mirror[mirror], np.arange(len(points)))
+    return mirror.astype(np.int32) if pairs and distance.max() < 1e-9 else None
+
+
+def _minimum_degree(matrix: sparse.csr_matrix) -> Ints:
+    if matrix.shape[0] < 2:
+        return np.arange(matrix.shape[0], dtype=np.int32)
+    ones = sparse.csc_matrix(matrix, copy=True)
+    order: Ints = np.argsort(_decompose(ones, "MMD_AT_PLUS_A").perm_c).astype(np.int32)
+    return order
+
+
+def _decompose(matrix: sparse.csc_matrix, order: str) -> object:
+    """Return the LU decomposition of a symmetric positive definite matrix, pivots on the diagonal."""
+    return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def incomplete_factor(stiffness: sparse.csr_matrix, order: Ints, weight: Floats) -> Factor:
+    """Return the thinned Cholesky factor of `stiffness` (m, m) plus the diagonal `weight` (m,), eliminated in `order`."""
+    m = len(order)
+    if m == 0:
+        empty, none = np.zeros(0), np.zeros(0, dtype=np.int32)
+        return Factor(none, empty, np.zeros(1, np.int32), none, empty, np.zeros(1, np.int32), none, empty)
+    soft = SOFTEST * stiffness.diagonal().mean()
+    whole = (stiffness + sparse.diags(weight + soft))[order][:, order].tocsc()
+    parts = _decompose(whole, "NATURAL")
+    lower = (parts.L @ sparse.diags(np.sqrt(parts.U.diagonal()))).tocoo()
+    diagonal = lower.tocsr().diagonal()
+    keep = (lower.row > lower.col) & (
+        np.abs(lower.data) >= DROPPED * np.sqrt(diagonal[lower.row] * diagonal[lower.col])
+    )
+    thin = sparse.csr_matrix((lower.data[keep], (lower.row[keep], lower.col[keep])), shape=(m, m))
+    back = thin.T.tocsr()
+    thin.sort_indices()
+    back.sort_indices()
+    return Factor(
+        np.ascontiguousarray(order, dtype=np.int32), 1.0 / diagonal,
+        thin.indptr.astype(np.int32), thin.indices.astype(np.int32), thin.data,
+        back.indptr.astype(np.int32), back.indices.astype(np.int32), back.data,
+    )  # fmt: skip
