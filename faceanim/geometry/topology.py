@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from faceanim.ground.arrays import Bools, Ints
+from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 
 
@@ -86,3 +87,12 @@ def colours(adjacent: Lists) -> Ints:
             colour += 1
         out[i] = colour
     return out
+
+
+def mirror_images(points: Floats) -> Ints | None:
+    """Return the vertex at the mirror image (x -> -x) of each of `points` (n, 3), or None if some image is no vertex."""
+    if not len(points):
+        return None
+    distance, image = cKDTree(points).query(points * [-1.0, 1.0, 1.0])
+    paired = np.array_equal(image[image], np.arange(len(points)))
+    return image.astype(np.int32) if paired and distance.max() < 1e-6 else None

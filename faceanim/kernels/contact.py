@@ -410,9 +410,32 @@ def find(x, colliders, grids, pose, reach, pair_reach, planes):
 
     pair_reach : the same for lips and lids, whose search is the dearest
     """
-    count = find_bones(x, colliders, grids, pose, reach, 0, planes)
-    count = find_spheres(x, colliders, reach, count, planes)
-    planes.count[0] = find_pairs(x, colliders, pair_reach, count, planes)
+    planes.count[1] = find_pairs(x, colliders, pair_reach, 0, planes)
+    find_rigid(x, colliders, grids, pose, reach, planes)
+
+
+@kernel
+def find_rigid(x, colliders, grids, pose, reach, planes):
+    """Find the contacts with bones and eyeballs anew, behind those of lips and lids, which stay as they are."""
+    count = find_bones(x, colliders, grids, pose, reach, planes.count[1], planes)
+    planes.count[0] = find_spheres(x, colliders, reach, count, planes)
+
+
+@kernel
+def hold_back(x, free, planes):
+    """Move the first `free` vertices of `x` (n, 3) back out of the other lip or lid, as far as the known planes say.
+
+    A guess that has gone through the other side would be taken for something behind it. Each side goes back half way.
+    """
+    for c in range(planes.count[1]):
+        gap = plane_gap(x, planes, c)
+        if gap < 0.0:
+            for k in range(4):
+                i = planes.node[c, k]
+                if i < free:
+                    w = 0.5 if k == 0 else -0.5 * planes.weight[c, k - 1]
+                    for d in range(3):
+                        x[i, d] -= w * gap * planes.normal[c, d]
 
 
 @kernel

@@ -143,7 +143,7 @@ class Planes(NamedTuple):
 
     Gap of contact c: normal . (x[node 0] - sum_k weight_k x[node k]) - offset; nodes 1-3 are -1 against rigid things.
 
-    count : (1,)   node : (c, 4)   weight, normal : (c, 3)   offset : (c,) [mm]   stiffness : (c,) [mN/mm]
+    count : (2,) all contacts, and those of lips and lids, which come first   node : (c, 4)   weight, normal : (c, 3)   offset : (c,) [mm]   stiffness : (c,) [mN/mm]
     What the search for pair contacts remembers from call to call, none of which changes what it finds:
     nearest : (cp,) the triangle nearest to each vertex last time   apart : (cp,) lower bound of the distance [mm]
     before : (n, 3) positions at the last call   ball : (t, 4) bounding spheres of the triangles
@@ -199,18 +199,32 @@ class Moment(NamedTuple):
 class Factor(NamedTuple):
     """A sparse lower triangular matrix L in rows of its own order, and its transpose, without their diagonals.
 
-    order : (n,) vertex of each row   inverse_diagonal : (n,)
+    order : (n,) vertex of each row   inverse_diagonal : (n,)   copies : (n,) factor of the right-hand side
     lower_start : (n + 1,)   lower_column, lower : (e,) rows of L   upper_start, upper_column, upper : those of L^T
     """
 
     order: I4
     inverse_diagonal: F8
+    copies: F8
     lower_start: I4
     lower_column: I4
     lower: F8
     upper_start: I4
     upper_column: I4
     upper: F8
+
+
+class Half(NamedTuple):
+    """How one half of a symmetric body stands for the whole; without ghosts and middle, all of it is there.
+
+    ghost, source : (g,) vertices beyond the plane x = 0 and those whose mirror images they are
+    middle : free vertices on the plane   copies : (m, 3) how often each free vertex occurs, 2 or 1, thrice
+    """
+
+    ghost: I4
+    source: I4
+    middle: I4
+    copies: F8
 
 
 class Drive(NamedTuple):

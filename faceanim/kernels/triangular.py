@@ -17,9 +17,10 @@ def solve_factored(factor, r, work, z):
     n = len(factor.order)
     for i in range(n):
         at = factor.order[i]
-        a = r[at, 0]
-        b = r[at, 1]
-        c = r[at, 2]
+        s = factor.copies[i]
+        a = s * r[at, 0]
+        b = s * r[at, 1]
+        c = s * r[at, 2]
         for e in range(factor.lower_start[i], factor.lower_start[i + 1]):
             j = 4 * np.intp(load(factor.lower_column, e))
             w = load(factor.lower, e)

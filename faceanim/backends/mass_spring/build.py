@@ -11,7 +11,7 @@ from faceanim.geometry import topology
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 from faceanim.kernels import contact
-from faceanim.kernels.tables import BoneGrids, Colliders, Fibres, Law, Layer, Planes, Scene, Springs, Tethers
+from faceanim.kernels.tables import BoneGrids, Colliders, Fibres, Half, Law, Layer, Planes, Scene, Springs, Tethers
 
 STIFFENING = 0.2
 """Depth at which the stiffness of a contact has grown fourfold [mm]."""
@@ -24,7 +24,7 @@ class Patch:
     nodes : (n,) body vertex of each   m : how many are free   held : (n,) those carried by the bones
     mass : (n,) [kg]   edge_of : (3, t) edge opposite each corner   pairs : (e, 2) vertices of each edge, smaller first;
     the first `n_pair` edges join free vertices   shear : (e, 2) of the layer beneath [mN/mm] and its growth [mN/mm^3]   scene : kernel tables
-    muscles : how many the body has
+    muscles : how many the body has   half : what is mirrored
     """
 
     nodes: Ints
@@ -37,6 +37,7 @@ class Patch:
     shear: Floats
     scene: Scene
     muscles: int
+    half: Half
 
 
 FACING = -0.2
@@ -140,8 +141,11 @@ class Tables:
         contact.pair_gaps(x, self.colliders, np.zeros((len(self.triangles), 4)), np.zeros_like(x), at_rest)
         np.minimum(pair_gap, at_rest, out=pair_gap)
 
-    def patch(self, free: Ints) -> Patch:
-        """Return the tables with the vertices `free` (in that order) free and their neighbourhood as the ring."""
+    def patch(self, free: Ints, mirror: Ints | None = None) -> Patch:
+        """Return the tables with the vertices `free` (in that order) free and their neighbourhood as the ring.
+
+        With `mirror` (n,), the image of each vertex, `free` is one half of what moves and the other half follows.
+        """
         n = len(self.body.surface.points)
         is_free = np.zeros(n, dtype=bool)
         is_free[free] = True
@@ -171,7 +175,7 @@ class Tables:
         shear = self.shear[_rows_of(self.edges, nodes[pairs])]
         return Patch(
             nodes, len(free), body.pinned[nodes], body.mass[nodes], edge_of, pairs, n_pair, shear, scene,
-            len(body.muscles.names),
+            len(body.muscles.names), _half(nodes, len(free), local, mirror),
         )  # fmt: skip
 
     def _pair_rows(self, is_free: Bools) -> Ints:
@@ -225,6 +229,19 @@ class Tables:
         )  # fmt: skip
 
 
+def _half(nodes: Ints, m: int, local: Ints, mirror: Ints | None) -> Half:
+    """Return which of `nodes` mirror which of the first `m` of them."""
+    if mirror is None:
+        none = np.zeros(0, dtype=np.int32)
+        return Half(none, none, none, np.ones((m, 3)))
+    image = local[mirror[nodes]]
+    ghost = (m + np.flatnonzero((image[m:] >= 0) & (image[m:] < m))).astype(np.int32)
+    middle = np.flatnonzero(mirror[nodes[:m]] == nodes[:m]).astype(np.int32)
+    copies = np.full((m, 3), 2.0)
+    copies[middle] = 1.0
+    return Half(ghost, np.ascontiguousarray(image[ghost], dtype=np.int32), middle, copies)
+
+
 def _rows_of(edges: Ints, pairs: Ints) -> Ints:
     """Return the row of each of `pairs` (k, 2) in the sorted list `edges` (e, 2)."""
     span = int(edges.max(initial=0)) + 1
@@ -238,7 +255,7 @@ def room_for_planes(colliders: Colliders, n: int) -> Planes:
     pairs = len(colliders.pair_node)
     size = max(1, len(colliders.bone_node) + len(colliders.sphere_node) + pairs)
     return Planes(
-        np.zeros(1, dtype=np.int32), np.full((size, 4), -1, dtype=np.int32), np.zeros((size, 3)), np.zeros((size, 3)),
+        np.zeros(2, dtype=np.int32), np.full((size, 4), -1, dtype=np.int32), np.zeros((size, 3)), np.zeros((size, 3)),
         np.zeros(size), np.zeros(size), colliders.pair_triangle[colliders.pair_start[:-1]].copy(), np.zeros(pairs),
         np.zeros((n, 3)), np.zeros((len(colliders.corners), 4)), np.zeros((n, 3)),
         np.zeros((len(colliders.bone_node), 4)),

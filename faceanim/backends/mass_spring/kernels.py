@@ -13,7 +13,7 @@ import numpy as np
 
 from faceanim.ground.jit import kernel
 from faceanim.kernels.attachment import carry, find_shift, growth, tether_force, tether_pull, tie
-from faceanim.kernels.contact import find, penalty, plane_force, plane_gap
+from faceanim.kernels.contact import find, find_rigid, penalty, plane_force, plane_gap
 from faceanim.kernels.muscles import aim, fibre_force, pull_of
 from faceanim.kernels.skin import skin_force
 from faceanim.kernels.springs import elastic_force
@@ -106,15 +106,13 @@ def finish(x, q, q_before, nodes, m, gamma, now, before, q_out, qd_out):
 
 
 @kernel
-def accelerated_sweeps(
-    x, scene, moment, scratch, weight, centre, low, high, sweeps, tolerance, reach, pair_reach, force, move
-):
+def accelerated_sweeps(x, scene, moment, scratch, weight, centre, low, high, sweeps, tolerance, reach, force, move):
     """Jacobi sweeps with Chebyshev acceleration on w (x - c) = F(x), in place.
 
     Each sweep divides every vertex's residual by w + k, with the k of the moment: stiffening and new contacts count
     at once. [low, high] : the eigenvalues to damp, of the matrix so scaled (at most 2)
     force : (n, 4), move : (n, 3) work   tolerance : stop when no vertex wants to go farther [mm]
-    reach, pair_reach : of the contacts, found anew halfway if vertices may have used up half of it by then
+    reach : of the contacts with bones and eyeballs, found anew halfway if vertices may have used up half of it by then
     Returns (sweeps made, largest residual [mN], largest wish [mm]) of the last sweep, before it moved.
     """
     middle = 0.5 * (high + low)
@@ -149,8 +147,8 @@ def accelerated_sweeps(
                 x[i, d] += move[i, d]
                 moment.shift[i, d] += move[i, d]
         travel += math.sqrt(farthest)
-        if sweep == sweeps // 2 and travel > 0.5 * pair_reach:
-            find(x, scene.colliders, scene.grids, moment.pose, reach, pair_reach, moment.planes)
+        if sweep == sweeps // 2 and travel > 0.5 * reach:
+            find_rigid(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)
         # A single sweep must not count as a solution unless nothing moves at all: its small errors would add up.
         if wish < tolerance * tolerance and (sweep >= 3 or wish < 1e-8 * tolerance * tolerance):
             return sweep + 1, math.sqrt(residual), math.sqrt(wish)
@@ -214,23 +212,69 @@ def residual_force(x, scene, moment, scratch, weight, centre, force, residual):
 
 
 @kernel
-def dot(a, b):
-    """Return the scalar product of `a` and `b` (m, 3)."""
+def dot(a, b, copies):
+    """Return the scalar product of `a` and `b`, each number counted as often as `copies` says, all (m, 3)."""
     one = a.reshape(a.size)
     other = b.reshape(b.size)
+    often = copies.reshape(copies.size)
     total = 0.0
     for i in range(one.size):
-        total += one[i] * other[i]
+        total += often[i] * one[i] * other[i]
     return total
 
 
 @kernel
-def go(x, shift, step, direction):
-    """Move the free vertices of `x` and `shift` (n, 3) by `step` times `direction` (m, 3)."""
+def reflect(x, half):
+    """Put the ghosts of `x` (n, 3) where the mirror images of their sources are, and middle vertices on the plane."""
+    for g in range(len(half.ghost)):
+        i = half.ghost[g]
+        j = half.source[g]
+        x[i, 0] = -x[j, 0]
+        x[i, 1] = x[j, 1]
+        x[i, 2] = x[j, 2]
+    flatten(x, half)
+
+
+@kernel
+def flatten(a, half):
+    """Take what points off the plane of symmetry from the middle vertices' rows of `a` (n, 3)."""
+    for i in half.middle:
+        a[i, 0] = 0.0
+
+
+@kernel
+def mirror_out(nodes, m, mirror, q, qd):
+    """Write the mirror images of the first `m` of `nodes` into positions and velocities `q`, `qd` (n, 3)."""
+    for k in range(m):
+        i = nodes[k]
+        j = mirror[i]
+        if i != j:
+            q[j, 0] = -q[i, 0]
+            qd[j, 0] = -qd[i, 0]
+            for d in range(1, 3):
+                q[j, d] = q[i, d]
+                qd[j, d] = qd[i, d]
+
+
+@kernel
+def asymmetry(a, mirror):
+    """Return how far the rows of `a` (n, 3) are from the mirror images of their images, the largest difference."""
+    worst = 0.0
+    for i in range(len(a)):
+        j = mirror[i]
+        worst = max(worst, abs(a[i, 0] + a[j, 0]), abs(a[i, 1] - a[j, 1]), abs(a[i, 2] - a[j, 2]))
+    return worst
+
+
+@kernel
+def go(x, shift, step, direction, half):
+    """Move the free vertices of `x` and `shift` (n, 3) by `step` times `direction` (m, 3), and the ghosts with them."""
     for i in range(len(direction)):
         for d in range(3):
             x[i, d] += step * direction[i, d]
             shift[i, d] += step * direction[i, d]
+    reflect(x, half)
+    reflect(shift, half)
 
 
 @kernel
@@ -243,19 +287,17 @@ def longest(a):
 
 
 @kernel
-def conjugate_gradient(
-    x, scene, moment, scratch, weight, centre, factor, most, tolerance, reach, pair_reach, force, work
-):
+def conjugate_gradient(x, scene, moment, scratch, weight, centre, half, factor, most, tolerance, reach, force, work):
     """Preconditioned nonlinear conjugate gradients (Polak-Ribiere, never negative) on w (x - c) = F(x), in place.
 
     Each iteration evaluates the forces once, a trial step ahead; the curvature met on the way gives the step's length,
     and the residual there follows by the same secant.
-    factor : `tables.Factor`   most : iterations   tolerance : stop when one moves no vertex farther [mm]
-    force : (n, 4), work : `Iterates`   reach, pair_reach : of the contacts, found anew halfway if vertices may have
-    used up half of it
+    half : `tables.Half`   factor : `tables.Factor`   most : iterations   tolerance : stop when one moves no vertex farther [mm]
+    force : (n, 4), work : residual, the one before, trial residual, preconditioned, direction (m, 3) and (m, 4)
+    reach : of the contacts with bones and eyeballs, found anew halfway if vertices may have used up half of it by then
     Returns (iterations, largest residual [mN], longest move of the last [mm]).
     """
-    residual, before, trial, z, direction, half = work
+    residual, before, trial, z, direction, solved = work
     find_shift(x, moment.anchor, moment.shift)
     residual_force(x, scene, moment, scratch, weight, centre, force, residual)
     step = FIRST_STEP
@@ -264,24 +306,26 @@ def conjugate_gradient(
     move = 0.0
     direction[:] = 0.0
     for k in range(most):
-        solve_factored(factor, residual, half, z)
-        rz = dot(residual, z)
-        keep = max(0.0, (rz - dot(before, z)) / rz_before) if rz_before > 0.0 else 0.0
+        flatten(residual, half)
+        solve_factored(factor, residual, solved, z)
+        flatten(z, half)
+        rz = dot(residual, z, half.copies)
+        keep = max(0.0, (rz - dot(before, z, half.copies)) / rz_before) if rz_before > 0.0 else 0.0
         for i in range(scene.free):
             for d in range(3):
                 direction[i, d] = z[i, d] + keep * direction[i, d]
         rz_before = rz
-        slope = dot(residual, direction)
+        slope = dot(residual, direction, half.copies)
         far = longest(direction)
         if not far > 0.0:
             return k, 0.0, 0.0
         guess = min(step, LONGEST_STEP / far)
-        go(x, moment.shift, guess, direction)
+        go(x, moment.shift, guess, direction, half)
         residual_force(x, scene, moment, scratch, weight, centre, force, trial)
-        bend = slope - dot(trial, direction)
+        bend = slope - dot(trial, direction, half.copies)
         step = guess * min(4.0, slope / bend) if bend > 0.25 * slope else 4.0 * guess
         step = min(step, LONGEST_STEP / far)
-        go(x, moment.shift, step - guess, direction)
+        go(x, moment.shift, step - guess, direction, half)
         share = step / guess
         for i in range(scene.free):
             for d in range(3):
@@ -291,8 +335,8 @@ def conjugate_gradient(
         travel += move
         if move < tolerance:
             return k + 1, longest(residual), move
-        if k == most // 2 and travel > 0.5 * pair_reach:
-            find(x, scene.colliders, scene.grids, moment.pose, reach, pair_reach, moment.planes)
+        if k == most // 2 and travel > 0.5 * reach:
+            find_rigid(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)
             residual_force(x, scene, moment, scratch, weight, centre, force, residual)
             rz_before = 0.0
     return most, longest(residual), move

@@ -63,6 +63,15 @@ class Load:
         scene, near = self.patch.scene, reach if pair_reach is None else pair_reach
         contact.find(x, scene.colliders, scene.grids, self.moment.pose, reach, near, self.moment.planes)
 
+    def ahead(self, v: Floats, h: float, least: float, reach: float, pair_reach: float) -> None:
+        """Move `x` on by h v and find the contacts for the step: those of lips and lids where it starts, still apart."""
+        scene, moment, x = self.patch.scene, self.moment, self.x
+        moment.planes.count[1] = contact.find_pairs(x, scene.colliders, pair_reach, 0, moment.planes)
+        kernels.extrapolate(x, v, h, least)
+        contact.hold_back(x, scene.free, moment.planes)
+        kernels.reflect(x, self.patch.half)
+        contact.find_rigid(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)
+
     def forces(self, x: Floats) -> Floats:
         """Return the forces at `x` with the stiffness bounds, (n, 4): springs, tethers, muscles and known contacts."""
         kernels.total_force(x, self.patch.scene, self.moment, self.scratch, self.force)

@@ -23,6 +23,7 @@ class Options:
     integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), for conjugate_gradient, block_descent and newton
     iterations : most conjugate gradient iterations in a step
     iteration_tolerance : they stop when one moves no vertex farther [mm]
+    symmetric : conjugate gradients work on one half while body, state and control are left-right symmetric
     sweeps : passes of block_descent over the vertices in a step
     adaptive : integrate only near the muscles that act and relax the rest quasi-statically (section 4 of the paper)
     tolerance : what the adaptive partition may cost in accuracy [mm]
@@ -38,11 +39,12 @@ class Options:
 
     scheme: str = "conjugate_gradient"
     integrator: str = "euler"
-    iterations: int = 8
-    iteration_tolerance: float = 1e-3
+    iterations: int = 10
+    iteration_tolerance: float = 3e-3
+    symmetric: bool = True
     sweeps: int = 20
     adaptive: bool = False
-    tolerance: float = 0.05
+    tolerance: float = 0.15
     quasi_static: str = "integrated"
     passes: int = 4
     sweep_tolerance: float = 3e-5

@@ -17,7 +17,9 @@ from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.jit import user_cache, writable_folder
 
 STATIC, QUASI_STATIC, DYNAMIC = 0, 1, 2
-_VERSION = b"1"
+FAINT = 0.05
+"""Share of a muscle's strongest pull per area at which its zone ends."""
+_VERSION = b"2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +80,18 @@ def anchors(body: Body, pose: Floats) -> Floats:
 
 
 def dynamic_set(body: Body, controls: Sequence[Control], tolerance: float) -> Bools:
-    """Return V_d: zones of the acting muscles, and vertices tied to an anchor that moves by `tolerance` [mm]."""
+    """Return V_d: zones of the acting muscles, and vertices tied to an anchor that moves by `tolerance` [mm].
+
+    Where a muscle's pull per area is below `FAINT` of its strongest, its zone ends.
+    """
     out = np.zeros(len(body.mass), dtype=bool)
     muscles = np.any([acting(c)[0] for c in controls], axis=0)
-    zone = muscles[body.muscles.muscle] & (body.muscles.weight > 0)
-    out[body.muscles.node[zone]] = True
+    u = body.muscles
+    density = u.weight / body.surface.vertex_areas[u.node]
+    strongest = np.zeros(len(u.names))
+    np.maximum.at(strongest, u.muscle, density)
+    zone = muscles[u.muscle] & (density > FAINT * strongest[u.muscle])
+    out[u.node[zone]] = True
     tied = (body.attachment.stiffness > 0) | body.pinned
     for control in controls:
         shift = anchors(body, control.bone_pose) - body.surface.points

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from scipy.spatial import cKDTree
 
 from faceanim.backends.mass_spring.load import Load
+from faceanim.geometry.topology import mirror_images
 from faceanim.ground.arrays import Floats, Ints
 from faceanim.kernels import attachment, tangent
 from faceanim.kernels.tables import Factor
@@ -25,7 +25,10 @@ SOFTEST = 1e-6
 
 
 def scalar_stiffness(load: Load) -> sparse.csr_matrix:
-    """Return the stiffness of the free vertices at rest, a third of the trace of each 3 x 3 block, (m, m) [mN/mm]."""
+    """Return the stiffness of the free vertices at rest, a third of the trace of each 3 x 3 block, (m, m) [mN/mm].
+
+    For a half, that of the whole body as a function of the half's positions: what comes twice counts twice.
+    """
     patch, m = load.patch, load.patch.m
     load.rest()
     diagonal, coupling = np.zeros((len(patch.nodes), 6)), np.zeros((len(patch.pairs), 9))
@@ -34,11 +37,18 @@ def scalar_stiffness(load: Load) -> sparse.csr_matrix:
     attachment.shear_coupling(load.x, anchor, patch.pairs, patch.shear[:, 0], patch.shear[:, 1], coupling)
     attachment.tether_blocks(load.x, anchor, patch.scene.tethers, m, diagonal)
     own = diagonal[:m, [0, 3, 5]].sum(axis=1) / 3.0
-    between = coupling[: patch.n_pair, [0, 4, 8]].sum(axis=1) / 3.0
-    i, j = patch.pairs[: patch.n_pair].T
-    k = np.arange(m)
-    rows, columns = np.concatenate([k, i, j]), np.concatenate([k, j, i])
-    return sparse.csr_matrix((np.concatenate([own, between, between]), (rows, columns)), shape=(m, m))
+    between = coupling[:, [0, 4, 8]].sum(axis=1) / 3.0
+    copies = patch.half.copies[:, 0]
+    stands_for = np.full(len(patch.nodes), -1)
+    stands_for[:m] = k = np.arange(m)
+    stands_for[patch.half.ghost] = patch.half.source
+    i, j = np.concatenate([patch.pairs, patch.pairs[:, ::-1]]).T
+    # From the middle to a ghost is the mirror image of what counts twice already.
+    middle = np.concatenate([copies == 1.0, np.zeros(len(patch.nodes) - m, dtype=bool)]) & (len(patch.half.ghost) > 0)
+    keep = (i < m) & (stands_for[j] >= 0) & ~(middle[i] & (j >= m))
+    rows, columns = np.concatenate([k, i[keep]]), np.concatenate([k, stands_for[j[keep]]])
+    values = np.concatenate([own, np.tile(between, 2)[keep]]) * np.maximum(copies[rows], copies[columns])
+    return sparse.csr_matrix((values, (rows, columns)), shape=(m, m))
 
 
 def contact_stiffness(load: Load, near: float) -> Floats:
@@ -62,7 +72,7 @@ def elimination_order(stiffness: sparse.csr_matrix, points: Floats) -> Ints:
     points : (m, 3) rest positions [mm]. Where the patch is symmetric about x = 0, one side's order is used for both and
     what lies between them comes last, so that thinning the factor leaves it symmetric.
     """
-    mirror = _mirror(points)
+    mirror = mirror_images(points)
     if mirror is None:
         return _minimum_degree(stiffness)
     coo = stiffness.tocoo()
@@ -74,15 +84,6 @@ def elimination_order(stiffness: sparse.csr_matrix, points: Floats) -> Ints:
     middle = np.flatnonzero(between)
     middle = middle[_minimum_degree(stiffness[middle][:, middle])]
     return np.concatenate([left, mirror[left], middle]).astype(np.int32)
-
-
-def _mirror(points: Floats) -> Ints | None:
-    """Return the vertex at the mirror image of each vertex, or None if some image is not a vertex."""
-    if not len(points):
-        return None
-    distance, mirror = cKDTree(points).query(points * [-1.0, 1.0, 1.0])
-    pairs = np.array_equal(mirror[mirror], np.arange(len(points)))
-    return mirror.astype(np.int32) if pairs and distance.max() < 1e-9 else None
 
 
 def _minimum_degree(matrix: sparse.csr_matrix) -> Ints:
@@ -98,14 +99,17 @@ def _decompose(matrix: sparse.csc_matrix, order: str) -> object:
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def incomplete_factor(stiffness: sparse.csr_matrix, order: Ints, weight: Floats) -> Factor:
-    """Return the thinned Cholesky factor of `stiffness` (m, m) plus the diagonal `weight` (m,), eliminated in `order`."""
+def incomplete_factor(stiffness: sparse.csr_matrix, order: Ints, weight: Floats, copies: Floats) -> Factor:
+    """Return the thinned Cholesky factor of `stiffness` (m, m) plus the diagonal `weight` (m,), eliminated in `order`.
+
+    copies : (m,) how often each vertex occurs; its weight and right-hand side count so often
+    """
     m = len(order)
     if m == 0:
         empty, none = np.zeros(0), np.zeros(0, dtype=np.int32)
-        return Factor(none, empty, np.zeros(1, np.int32), none, empty, np.zeros(1, np.int32), none, empty)
+        return Factor(none, empty, empty, np.zeros(1, np.int32), none, empty, np.zeros(1, np.int32), none, empty)
     soft = SOFTEST * stiffness.diagonal().mean()
-    whole = (stiffness + sparse.diags(weight + soft))[order][:, order].tocsc()
+    whole = (stiffness + sparse.diags(copies * weight + soft))[order][:, order].tocsc()
     parts = _decompose(whole, "NATURAL")
     lower = (parts.L @ sparse.diags(np.sqrt(parts.U.diagonal()))).tocoo()
     diagonal = lower.tocsr().diagonal()
@@ -117,7 +121,7 @@ def incomplete_factor(stiffness: sparse.csr_matrix, order: Ints, weight: Floats)
     thin.sort_indices()
     back.sort_indices()
     return Factor(
-        np.ascontiguousarray(order, dtype=np.int32), 1.0 / diagonal,
+        np.ascontiguousarray(order, dtype=np.int32), 1.0 / diagonal, np.ascontiguousarray(copies[order]),
         thin.indptr.astype(np.int32), thin.indices.astype(np.int32), thin.data,
         back.indptr.astype(np.int32), back.indices.astype(np.int32), back.data,
     )  # fmt: skip

@@ -22,8 +22,8 @@ from faceanim.kernels.tables import Drive, Factor
 
 REACH = 1.5
 """Contacts within this distance [mm] of their clearance are watched during a step."""
-PAIR_REACH = 1.0
-"""The same for lips and lids, whose search is the dearest."""
+PAIR_REACH = 2.5
+"""The same for lips and lids, which are watched from where a step starts."""
 HIGHEST = 2.0
 """No eigenvalue of the stiffness, divided by the stiffness bounds, is larger (see `elastic_force`)."""
 MARGIN = 1.2
@@ -32,8 +32,10 @@ RESOLVED = 1.5
 """n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
 SETTLED = 0.02
 """A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
-CONTACT_SHARE = 0.5
+CONTACT_SHARE = 0.2
+"""Share of the stiffness of contacts that the preconditioner counts on: most do not touch most of the time."""
 CONTACT_NEAR = 1.0
+"""Contacts that may touch are those nearer at rest than this [mm]."""
 MOST_FACTORS = 4
 """Factors are kept for so many different time steps."""
 MOST_SUBSTEPS = 100_000
@@ -105,8 +107,7 @@ class _Implicit(_Patchwise):
             motion.q, motion.qd, motion.q_before, motion.qd_before, patch.nodes, patch.mass, patch.m, self.drag, gamma,
             now, before, self.centre, self.weight,
         )  # fmt: skip
-        kernels.extrapolate(x, self.v, h, self.options.sweep_tolerance)
-        self.load.touch(x, REACH, PAIR_REACH)
+        self.load.ahead(self.v, h, self.options.sweep_tolerance, REACH, PAIR_REACH)
         self._minimise(gamma, report)
         kernels.finish(
             x, motion.q, motion.q_before, patch.nodes, patch.m, gamma, now, before, motion.q_new, motion.qd_new
@@ -131,7 +132,7 @@ class BlockDescent(_Implicit):
             self._gamma, self._low = gamma, self.spectrum.low(self.weight, options.sweeps)
         sweeps, residual, wish = kernels.accelerated_sweeps(
             load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self._low, self.spectrum.high,
-            options.sweeps, options.sweep_tolerance, REACH, PAIR_REACH, load.force, self.move,
+            options.sweeps, options.sweep_tolerance, REACH, load.force, self.move,
         )  # fmt: skip
         report.iterations += sweeps
         report.residual = max(report.residual, residual)
@@ -144,6 +145,7 @@ class ConjugateGradient(_Implicit):
     def __init__(self, load: Load, drag: float, options: Options) -> None:
         super().__init__(load, drag, options)
         m = load.patch.m
+        self.copies = load.patch.half.copies[:, 0].copy()
         self.work = (*(np.zeros((m, 3)) for _ in range(5)), np.zeros((m, 4)))
         self.stiffness = scalar_stiffness(load)
         self.touching = CONTACT_SHARE * contact_stiffness(load, CONTACT_NEAR)
@@ -156,11 +158,11 @@ class ConjugateGradient(_Implicit):
             if len(self.factors) > MOST_FACTORS:
                 self.factors.clear()
             self.factors[gamma] = incomplete_factor(
-                self.stiffness, self.order, self.touching + self.weight[: load.patch.m]
+                self.stiffness, self.order, self.touching + self.weight[: load.patch.m], self.copies
             )
         iterations, residual, move = kernels.conjugate_gradient(
-            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, self.factors[gamma],
-            options.iterations, options.iteration_tolerance, REACH, PAIR_REACH, load.force, self.work,
+            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, load.patch.half, self.factors[gamma],
+            options.iterations, options.iteration_tolerance, REACH, load.force, self.work,
         )  # fmt: skip
         report.iterations += iterations
         report.residual = max(report.residual, residual)
@@ -186,14 +188,13 @@ class QuasiStatic(_Patchwise):
         load, patch, x = self.load, self.load.patch, self.load.x
         kernels.gather(motion.q_new, motion.qd, patch.nodes, patch.held, load.moment, x, self.v)
         self.v[patch.m :] = 0.0
-        kernels.extrapolate(x, self.v, h, self.options.sweep_tolerance)
-        load.touch(x, REACH, PAIR_REACH)
+        load.ahead(self.v, h, self.options.sweep_tolerance, REACH, PAIR_REACH)
         options, scene = self.options, patch.scene
         if options.quasi_static == "chebyshev":
             kernels.accelerated_sweeps(
                 x, scene, load.moment, load.scratch, self.weight, self.centre, self.low, self.spectrum.high,
                 options.passes,
-                options.sweep_tolerance, REACH, PAIR_REACH, load.force, self.move,
+                options.sweep_tolerance, REACH, load.force, self.move,
             )  # fmt: skip
         else:
             kernels.contact_chains(load.moment.planes, self.head, self.link)

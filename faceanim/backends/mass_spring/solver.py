@@ -15,7 +15,8 @@ from faceanim.backends.mass_spring.load import Load
 from faceanim.backends.mass_spring.newton import Newton, NewtonReport
 from faceanim.backends.mass_spring.options import Options
 from faceanim.backends.mass_spring.partition import Partition, content_key
-from faceanim.backends.mass_spring.schemes import Explicit, Motion, QuasiStatic, make_scheme
+from faceanim.backends.mass_spring.schemes import Explicit, Motion, QuasiStatic, Scheme, make_scheme
+from faceanim.backends.mass_spring.symmetry import find_symmetry
 from faceanim.backends.solver import Energy, State, StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
@@ -89,10 +90,14 @@ class SolverMassSpring:
         self._statics: Newton | None = None
         self._everything: Load | None = None
         self.partition: Partition | None = None
-        self._dynamic = make_scheme(Load(self.tables.patch(self._free)), body.damping, self.options)
+        self._moving = self._free
+        self._schemes: dict[bool, Scheme] = {}
         self._quasi_static: QuasiStatic | None = None
-        if isinstance(self._dynamic, Explicit):
-            self.dt_max = self._dynamic.largest_step()
+        self._symmetry = find_symmetry(body) if self.options.symmetric else None
+        if self.options.scheme == "explicit":
+            whole = self._scheme(False)
+            assert isinstance(whole, Explicit)
+            self.dt_max = whole.largest_step()
 
     def rest(self) -> StateMassSpring:
         """Return a new state: the body at rest."""
@@ -189,8 +194,13 @@ class SolverMassSpring:
         started = perf_counter()
         self._recall(state_in)
         self.pins.move(control, self._motion, dt)
-        self._dynamic.load.apply(control)
-        self._dynamic.advance(self._motion, dt, report)
+        half = self._halves(state_in, control)
+        scheme = self._scheme(half)
+        scheme.load.apply(control)
+        scheme.advance(self._motion, dt, report)
+        if half and self._symmetry is not None:
+            patch, motion = scheme.load.patch, self._motion
+            kernels.mirror_out(patch.nodes, patch.m, self._symmetry.vertex, motion.q_new, motion.qd_new)
         between = perf_counter()
         if self._quasi_static is not None:
             self._quasi_static.load.apply(control)
@@ -249,10 +259,28 @@ class SolverMassSpring:
             dynamic, quasi = np.union1d(dynamic, quasi).astype(np.int32), quasi[:0]
         if self.options.quasi_static == "waves":
             quasi = quasi[np.argsort(found.wave[quasi], kind="stable")]
-        self._dynamic = make_scheme(Load(self.tables.patch(dynamic)), self.body.damping, self.options)
+        self._moving = dynamic
+        self._schemes.clear()
         self._quasi_static = None
         if len(quasi):
             self._quasi_static = QuasiStatic(Load(self.tables.patch(quasi)), self.body.damping, self.options)
+
+    def _halves(self, state: State, control: Control) -> bool:
+        """Return whether one half of the body is enough for the step from `state`."""
+        if self._symmetry is None or self.options.scheme != "conjugate_gradient" or self._quasi_static is not None:
+            return False
+        return self._symmetry.holds(state.q, state.qd, control)
+
+    def _scheme(self, half: bool) -> Scheme:
+        """Return the scheme for what moves, or for the half of it that has x >= 0; made when first needed."""
+        if half not in self._schemes:
+            free, mirror = self._moving, None
+            if half and self._symmetry is not None:
+                mirror = self._symmetry.vertex
+                whole = np.union1d(free, mirror[free])
+                free = whole[(self.body.surface.points[whole, 0] > 0.0) | (mirror[whole] == whole)].astype(np.int32)
+            self._schemes[half] = make_scheme(Load(self.tables.patch(free, mirror)), self.body.damping, self.options)
+        return self._schemes[half]
 
     def _recall(self, state: State) -> None:
         motion = self._motion
