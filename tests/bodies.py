@@ -97,7 +97,7 @@ def held_sheet(nx: int = 14, ny: int = 14, *, colliders: bool = True, force: flo
             surface.vertex_areas * 0.8,
             shear=np.full(len(surface.triangles), 3.0),
             shear_limit=np.full(len(surface.triangles), 0.4),
-        ),  # fmt: skip
+        ),
         "muscles": two_muscles(x, ~pinned, force),
         "bones": bones,
         "bone_contact": bone_contact,

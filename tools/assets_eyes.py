@@ -2,40 +2,51 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-SEGMENTS = 96
+SEGMENTS, BACK_SEGMENTS = 48, 16  # in front of and behind the widest visible ring
 PUPIL, COLLARETTE, IRIS = 1.75, 2.9, 5.85  # mm, radii seen from the front
 BULGE = 0.2  # mm, cornea above the globe
+RINGS = (1.62, 1.95, 2.3, 2.75, 3.3, 4.1, 4.9, 5.5, 5.85, 6.1, 6.4)  # mm, where the colour changes
+SHOWN, BACK = np.radians(84.0), np.radians((112.0, 146.0))  # polar angles: the lids hide all beyond SHOWN
 
 
-def _polar(radius: float) -> np.ndarray:
-    """Polar angles of the rings, dense over the iris."""
-    iris = np.arcsin(np.linspace(0.16, IRIS + 0.7, 38) / radius)
-    rest = iris[-1] + (np.pi - iris[-1]) * np.linspace(0.0, 1.0, 24)[1:-1] ** 1.15
-    return np.concatenate([iris, rest])
+def _rings(radius: float) -> list[tuple[float, int]]:
+    """Polar angle and number of vertices of each ring, from the front to the back."""
+    iris = np.arcsin(np.array(RINGS) / radius)
+    white = iris[-1] + (SHOWN - iris[-1]) * np.linspace(0.0, 1.0, 6)[1:]
+    return [(float(t), SEGMENTS) for t in (*iris, *white)] + [(float(t), BACK_SEGMENTS) for t in BACK]
+
+
+def _between(a: int, n: int, b: int, m: int) -> np.ndarray:
+    """Triangles between a ring of n vertices from index a on and one of m (a divisor of n) from b on, outside it."""
+    i, k = np.arange(n), n // m
+    j, end = i // k, ((i + 1) // k) % m
+    near = np.stack([a + i, b + j, a + (i + 1) % n], axis=1)
+    step = (i + 1) % k == 0
+    return np.vstack([near, np.stack([a + (i + 1) % n, b + j, b + end], axis=1)[step]])
 
 
 def globe(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) around the origin looking along +z, and triangles (t, 3)."""
-    theta = _polar(radius)
-    phi = 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
-    t, f = np.meshgrid(theta, phi, indexing="ij")
+    """Points (n, 3) around the origin looking along +z, and triangles (t, 3); coarse where no lid ever opens."""
+    rings = _rings(radius)
+    t = np.concatenate([np.full(n, angle) for angle, n in rings])
+    f = np.concatenate([2 * np.pi * np.arange(n) / n for _, n in rings])
     cornea = np.clip(1.0 - (radius * np.sin(t) / (IRIS + 0.6)) ** 2, 0.0, 1.0) * (t < np.pi / 2)
     r = radius + BULGE * cornea**1.5
-    ring = np.stack([r * np.sin(t) * np.cos(f), r * np.sin(t) * np.sin(f), r * np.cos(t)], axis=2).reshape(-1, 3)
+    ring = np.stack([r * np.sin(t) * np.cos(f), r * np.sin(t) * np.sin(f), r * np.cos(t)], axis=1)
     points = np.vstack([ring, [[0.0, 0.0, radius + BULGE], [0.0, 0.0, -radius]]])
-    m, k = len(theta), np.arange(SEGMENTS)
-    nxt = (k + 1) % SEGMENTS
-    first, last = np.full(SEGMENTS, len(ring)), np.full(SEGMENTS, len(ring) + 1)
-    triangles = [np.stack([first, k, nxt], axis=1)]
-    for i in range(m - 1):
-        a, b = i * SEGMENTS, (i + 1) * SEGMENTS
-        triangles += [np.stack([a + k, b + k, b + nxt], axis=1), np.stack([a + k, b + nxt, a + nxt], axis=1)]
-    end = (m - 1) * SEGMENTS
-    triangles.append(np.stack([end + k, last, end + nxt], axis=1))
+    first = np.concatenate([[0], np.cumsum([n for _, n in rings])])
+    k = np.arange(SEGMENTS)
+    triangles = [np.stack([np.full(SEGMENTS, len(ring)), k, (k + 1) % SEGMENTS], axis=1)]
+    for i, ((_, n), (_, m)) in enumerate(pairwise(rings)):
+        triangles.append(_between(int(first[i]), n, int(first[i + 1]), m))
+    k = np.arange(rings[-1][1])
+    end = int(first[-2])
+    triangles.append(np.stack([end + k, np.full(len(k), len(ring) + 1), end + (k + 1) % len(k)], axis=1))
     return points, np.vstack(triangles)
 
 
@@ -47,10 +58,10 @@ def _step(x: np.ndarray, low: float, high: float) -> np.ndarray:
 def _fibres(phi: np.ndarray, radius: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Radial fibres of the iris: a sum of waves around it whose phase drifts outwards, about -1 to 1."""
     out = np.zeros_like(phi)
-    for waves in (5, 9, 14, 19, 23, 31, 37, 44):
+    for waves in (5, 9, 14, 19, 23):
         turn, drift = rng.uniform(0, 2 * np.pi), rng.uniform(-0.6, 0.6)
         out += rng.uniform(0.5, 1.0) * np.cos(waves * phi + turn + drift * radius)
-    return out / 3.0
+    return out / 2.4
 
 
 def colour(points: np.ndarray, seed: int) -> np.ndarray:

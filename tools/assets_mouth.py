@@ -79,6 +79,10 @@ PROFILE_AT = (0.0, 0.15, 0.4, 0.65, 0.85, 1.0)
 SQUARENESS = {"incisor": 2.7, "lateral": 2.5, "lower": 2.6, "canine": 2.2, "premolar": 2.3, "molar": 2.9}
 ROOT = 5.0  # mm of each tooth hidden in the gum
 
+# Heights of the rings of a crown, -1 root, 0 neck, 1 rim: fewer where the lips and cheeks leave little to be seen.
+FRONT_RINGS = (-1.0, -0.12, 0.0, 0.15, 0.36, 0.6, 0.8, 0.93, 1.0)
+BACK_RINGS = (-1.0, 0.0, 0.2, 0.5, 0.77, 0.92, 1.0)
+
 IVORY = np.array([236.0, 226.0, 204.0])
 NECK_TINT = np.array([224.0, 203.0, 168.0])
 EDGE_TINT = np.array([226.0, 224.0, 216.0])
@@ -176,18 +180,21 @@ def plan_bite(face: dict[str, np.ndarray]) -> Plan:
     return Plan(lip_line, Arch(UPPER_ARCH, front), Arch(LOWER_ARCH, front - step))
 
 
-def crown(kind: str, width: float, depth: float, height: float, around: int = 22) -> tuple[np.ndarray, ...]:
+def crown(kind: str, width: float, depth: float, height: float) -> tuple[np.ndarray, ...]:
     """Return one tooth in its own frame (x to the left, y towards the edge, z labial; y = 0 at the neck) with shades.
 
     Points (n, 3) [mm], triangles (t, 3), height share (n,) in [-1, 1].
     """
+    around, heights, insides = (
+        (14, BACK_RINGS, (0.66, 0.3)) if kind in ("premolar", "molar") else (18, FRONT_RINGS, (0.5,))
+    )
     theta = 2.0 * np.pi * (np.arange(around) + 0.5) / around
     power = 2.0 / SQUARENESS[kind]
     cx = np.sign(np.cos(theta)) * np.abs(np.cos(theta)) ** power
     cz = np.sign(np.sin(theta)) * np.abs(np.sin(theta)) ** power
     tables = [PchipInterpolator(PROFILE_AT, row) for row in PROFILE[kind]]
     rings, shade = [], []
-    for t in (-1.0, -0.5, -0.12, 0.0, 0.1, 0.22, 0.36, 0.5, 0.64, 0.77, 0.88, 0.95, 1.0):
+    for t in heights:
         w, b, l = (float(f(max(t, 0.0))) for f in tables)
         taper = 1.0 + 0.32 * min(t, 0.0)
         x = 0.5 * width * w * taper * cx
@@ -199,7 +206,7 @@ def crown(kind: str, width: float, depth: float, height: float, around: int = 22
         rings.append(np.stack([x, y + _rim_drop(kind, x / (0.5 * width), z / depth, height) * max(t, 0.0) ** 3, z], 1))
         shade.append(np.full(around, t))
     rim = rings[-1]
-    for s in (0.86, 0.66, 0.42, 0.2):
+    for s in insides:
         inner = rim * [s, 1.0, s] + [0.0, 0.0, (1.0 - s) * rim[:, 2].mean()]
         inner[:, 1] = height + _occlusal(kind, inner[:, 0] / (0.5 * width), inner[:, 2] / depth, height, s)
         rings.append(inner)
@@ -289,7 +296,7 @@ def _enamel(share: np.ndarray) -> np.ndarray:
     return IVORY + 0.8 * low * (NECK_TINT - IVORY) + 0.6 * high * (EDGE_TINT - IVORY)
 
 
-def build_gums(plan: Plan, upper: bool, places: list[tuple[float, float, float]], per_tooth: int = 10) -> Piece:
+def build_gums(plan: Plan, upper: bool, places: list[tuple[float, float, float]], per_tooth: int = 6) -> Piece:
     """Return the gum of one arch: a ridge along the row, scalloped round each neck, with a papilla between teeth."""
     arch = plan.upper if upper else plan.lower
     teeth = UPPER_TEETH if upper else LOWER_TEETH
@@ -334,9 +341,9 @@ def build_gums(plan: Plan, upper: bool, places: list[tuple[float, float, float]]
 
 
 _GUM_SECTION = (
-    (1.0, 0.6, -1.0), (1.0, 1.1, -0.7), (1.0, 1.2, -0.4), (1.0, 1.0, -0.15), (1.0, 0.85, 0.3), (1.0, 0.6, 0.75),
-    (1.0, 0.2, 0.97), (0.8, 0.0, 1.0), (0.0, 0.0, 1.0), (-0.8, 0.0, 1.0), (-1.0, 0.2, 0.97), (-1.0, 0.6, 0.75),
-    (-1.0, 0.85, 0.3), (-1.0, 1.0, -0.15), (-1.0, 1.2, -0.4), (-1.0, 1.0, -0.7), (-1.0, 0.4, -1.0),
+    (1.0, 0.6, -1.0), (1.0, 1.2, -0.5), (1.0, 1.0, -0.15), (1.0, 0.85, 0.3), (1.0, 0.6, 0.75), (1.0, 0.2, 0.97),
+    (0.8, 0.0, 1.0), (-0.8, 0.0, 1.0), (-1.0, 0.2, 0.97), (-1.0, 0.6, 0.75), (-1.0, 0.85, 0.3), (-1.0, 1.2, -0.4),
+    (-1.0, 0.4, -1.0),
 )  # fmt: skip
 """Section of a gum: place across, bulge [mm], level (above 0 in shares of the margin, below 0 in shares of 9 mm)."""
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from faceanim.backends.solver import State
 from faceanim.bench.metrics import FieldError, field_error, worst
 from faceanim.ground.arrays import Floats
 from faceanim.session.session import Session
@@ -22,14 +21,16 @@ class Accuracy:
     """Measured errors [mm] over all vertices.
 
     partition : against the same run with every vertex dynamic, worst frame (None for a full run)
-    rest : the held apex against the converged equilibrium near it (a skin in contact can have several)
+    rest : the held apex against the converged equilibrium, found from rest
     trajectory : against the converged trajectory (Newton, `FINE_STEPS` times the steps), worst frame
+    trajectory_share : the same as a share: root of the squared errors over the squared displacements, whole run [-]
     largest_movement : of the apex [mm], to compare with
     """
 
     partition: FieldError | None
     rest: FieldError | None
     trajectory: FieldError | None
+    trajectory_share: float | None
     largest_movement: float
 
 
@@ -47,30 +48,29 @@ def measure(session: Session, positions: Floats, *, trajectory: bool = False) ->
     frame = apex_frame(session)
     apex = np.asarray(positions[frame])
     size = float(np.linalg.norm(apex - session.body.surface.points, axis=1).max())
-    result = Accuracy(None, None, None, size)
+    result = Accuracy(None, None, None, None, size)
     full = full_session(session)
     if full is not None:
         result = replace(result, partition=_against(full, positions))
         yield result
     reference = session if full is None else full
-    state = reference.solver.solve_static(
-        session.control(session.timeline.at(frame / session.fps)), _near(reference, apex)
-    )
+    state = reference.solver.solve_static(session.control(session.timeline.at(frame / session.fps)))
     points = np.empty_like(apex)
     reference.solver.surface(state, points)
     result = replace(result, rest=field_error(apex, points))
     yield result
     if trajectory:
-        yield replace(result, trajectory=_against(_converged_session(session), positions))
+        yield _along(session, positions, result)
 
 
-def _near(session: Session, points: Floats) -> State | None:
-    """Return a state with the surface at `points`, None if the backend's unknowns are not positions."""
-    state = session.solver.rest()
-    if state.q.shape != points.shape:
-        return None
-    state.q[:] = points
-    return state
+def _along(session: Session, positions: Floats, result: Accuracy) -> Accuracy:
+    """Return `result` with the comparison with the converged trajectory."""
+    rest, errors, off, way = session.body.surface.points, [], 0.0, 0.0
+    for frame in _converged_session(session).frames(copy=False):
+        errors.append(field_error(positions[frame.index], frame.points))
+        off += float(((positions[frame.index] - frame.points) ** 2).sum())
+        way += float(((frame.points - rest) ** 2).sum())
+    return replace(result, trajectory=worst(errors), trajectory_share=float(np.sqrt(off / way)) if way > 0.0 else 0.0)
 
 
 def _against(reference: Session, positions: Floats) -> FieldError:

@@ -207,7 +207,10 @@ class Production:
             if self.accuracy.rest is not None:
                 parts.append(f"{self.accuracy.rest.max:.2g} mm from the true equilibrium")
             if self.accuracy.trajectory is not None:
-                parts.append(f"{self.accuracy.trajectory.max:.2g} mm from the converged trajectory")
+                share = 100.0 * (self.accuracy.trajectory_share or 0.0)
+                parts.append(
+                    f"{share:.2g} % off the converged trajectory (at most {self.accuracy.trajectory.max:.2g} mm)"
+                )
             accuracy = f"; at most {', '.join(parts)} (movement {self.accuracy.largest_movement:.1f} mm)"
         return (
             f"{self.session.expression.name}: {pictures} frames, {', '.join(others)} in {self.results.folder}; "

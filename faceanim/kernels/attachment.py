@@ -2,7 +2,8 @@
 
 Energy of one tether of length s: k s0^2 / (2 (alpha + 1)) [(1 + (s/s0)^2)^(alpha + 1) - 1]; force and tangent are its
 first and second derivatives. The shear layer couples the displacements u = x - anchor of neighbours i, j with the
-energy w/2 d^2 + b/4 d^4 per edge, d = |u_i - u_j|: convex, and ever stiffer the more the skin would fold. All kernels add to what `force` (n, 4) (three components and a stiffness bound) holds.
+energy w/2 d^2 + b/4 d^4 per edge, d = |u_i - u_j|: convex, and ever stiffer the more the skin would fold.
+All kernels add to what `force` (n, 4) (three components and a stiffness bound) holds.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """Rasteriser: triangles to anti-aliased pixels, in three passes over bare arrays.
 
-1. `vertex_pass` and `setup_pass`: vertex normals by gather, projection, culling, plane equations, horizontal bands.
-2. `coverage_pass`: four rotated-grid samples a pixel, each with the depth and the name of the nearest triangle.
+1. `place_pass` and `setup_pass`: vertex normals, projection, culling, plane equations, and the depth seen from the
+   key light; `band_pass` then sorts the triangles into horizontal bands.
+2. `coverage_pass`: four rotated-grid samples a pixel, each with the depth and the index of the nearest triangle.
    Edges are integers in 1/256 pixel, so that neighbouring triangles neither overlap nor leave a gap.
 3. `shade.shade_pass`: each pixel is shaded once for every surface seen in it, weighted by the samples covered.
 
-Bands of rows are independent and visit their triangles in index order: the picture does not depend on the number of
+Bands of rows are independent and visit their triangles in a fixed order: the picture does not depend on the number of
 threads. Camera space has x to the right, y up and z away from the eye; a pixel's ray is (rx, ry, 1), and the sums
 w_i = E_i . ray of a triangle are its barycentric coordinates divided by depth, even if it crosses the near plane.
 """
@@ -18,21 +19,25 @@ import numpy as np
 from numba import get_thread_id  # type: ignore[attr-defined]
 
 from faceanim.ground.jit import kernel, prange
+from faceanim.kernels.memory import load
+from faceanim.kernels.shadow import cast_piece, moment_strip
 
 BAND = 16
-FEW = 30  # blocks: for triangles up to this size it pays to ask first whether they are hidden
-CHUNK = 512
+PIECES = 8  # tasks of the pass over triangles; each takes every eighth chunk
+CHUNK = 128
 SUB = 256
 HALF = SUB // 2
 REACH = 96
 FAR_PIXEL = float(1 << 20)
 BEHIND = -(1 << 30)
-LAST_NAME = (1 << 31) - 1
 DEEPEST = float(1 << 30)
 FINE = 12  # further bits of a depth number while it is stepped from pixel to pixel
 STEEPEST = float(1 << 46)
+TOP = (1 << 30) - 1
+LONG = 24  # bits of an edge [1/256 pixel] up to which its side of a sample is exact
+BLOCK = 16  # samples of four neighbouring pixels
 
-# Offsets, in eighths of a pixel, of the 16 samples of four neighbouring pixels from the centre of the first one.
+# Offsets, in eighths of a pixel, of the samples of a block from the centre of its first pixel.
 _RIGHT = np.array([8 * i + s for i in range(4) for s in (-1, 3, 1, -3)], dtype=np.int64)
 _DOWN = np.array([s for i in range(4) for s in (-3, -1, 3, 1)], dtype=np.int64)
 
@@ -40,42 +45,51 @@ _DOWN = np.array([s for i in range(4) for s in (-3, -1, 3, 1)], dtype=np.int64)
 class Mesh(NamedTuple):
     """What does not change between frames; vertices and triangles of all items, one after the other.
 
-    triangle : (t, 3)   item : (t,)   start : (n + 1,), incident : (3 t,) triangles of each vertex   owner : (n,) item
-    uv : (t, 6) of the corners
+    A point where texture pieces meet counts as one vertex for each of its places in the texture.
+    triangle : (t, 3) vertices   item : (t,)   owner : (n,) item of each vertex   origin : (n,) its point
+    start : (n + 1,), fan : (k, 2) points of the opposite edges of the triangles around each vertex
+    texels : (t,) log2 of the texture's area in the triangle [texel]
     """
 
     triangle: np.ndarray
     item: np.ndarray
-    start: np.ndarray
-    incident: np.ndarray
     owner: np.ndarray
-    uv: np.ndarray
+    origin: np.ndarray
+    start: np.ndarray
+    fan: np.ndarray
+    texels: np.ndarray
 
 
 class Frame(NamedTuple):
     """Buffers of one picture.
 
-    facet : (t, 3) area-weighted normals [mm^2]   eye : (n, 3) camera space [mm]   screen : (n, 2) [1/256 pixel]
-    vertex : (n, 8) normal, occlusion, linear colour, depth   plane : (t, 16) rows E_i and the P_ columns
-    deep : (t, 8) depth number: gradient in x and y, value at pixel (0, 0), least, largest; side (1 front, -1 back)
-    box : (t, 4) first and last pixel in x and y; empty if culled
-    sample : (slots, BAND, ceil(w / 4), 16) four a pixel, 0 = none: depth number << 32 | LAST_NAME - triangle, so that
-    the larger of two is the nearer, and of equals the first triangle
+    eye : (n, 3) camera space [mm]   screen : (n, 2) [1/256 pixel]
+    vertex : (n, 8) normal, occlusion, linear colour or place in the texture, depth
+    plane : (t, 16) rows E_i and the P_ columns
+    deep : (t, 4) fine depth number: gradient in x and y, value at pixel (0, 0)
+    corner : (t, 8) x and y on the screen, four corners if the near plane cuts it, else the last one twice [1/256 pixel]
+    box : (t, 8) first and last pixel in x and y, least and largest depth number
+    rank : (t,) 0 not seen, else 1 drawn first or 2 drawn then, the first and last band from bits 2 and 17 on
+    sample : (slots, BAND, ceil(w / 4), 2 BLOCK) depth numbers (0 = none) and triangles of the samples of a block
+    least : (slots, BAND, ceil(w / 4)) smallest depth number of a block   lane : (slots, 4, BLOCK) work space
     nearest : (h, w) depth number of the nearest sample, 0 = none
-    row_start : (bands + 1,)   row_list : triangles by band
-    fragment : (h, N_WHOLE, 4 w) pixel, triangle and number of samples of each surface seen in each row, from left to
+    row_start : (2 bands + 1,)   row_list : triangles by band and rank
+    fragment : (h, N_WHOLE, row_length) pixel, triangle and number of samples of each surface seen in each row, from left to
     right; `found` (h,) of them
     A depth number is DEEPEST * near / depth, a whole number up to DEEPEST.
     """
 
-    facet: np.ndarray
     eye: np.ndarray
     screen: np.ndarray
     vertex: np.ndarray
     plane: np.ndarray
     deep: np.ndarray
+    corner: np.ndarray
     box: np.ndarray
+    rank: np.ndarray
     sample: np.ndarray
+    least: np.ndarray
+    lane: np.ndarray
     nearest: np.ndarray
     row_start: np.ndarray
     row_list: np.ndarray
@@ -83,38 +97,43 @@ class Frame(NamedTuple):
     found: np.ndarray
 
 
-def _aligned(rows: int, columns: int, kind: type) -> np.ndarray:
-    """Return zeros (rows, columns) that start at a cache line, so that rows of 32 or 64 bytes do not straddle two."""
-    size = np.dtype(kind).itemsize
-    raw: np.ndarray = np.zeros(rows * columns + 64 // size, kind)
+def _aligned(shape: tuple[int, ...], kind: type) -> np.ndarray:
+    """Return zeros that start at a cache line, so that rows of 32 or 64 bytes do not straddle two."""
+    size, count = np.dtype(kind).itemsize, int(np.prod(shape))
+    raw: np.ndarray = np.zeros(count + 64 // size, kind)
     skip = (-raw.ctypes.data % 64) // size
-    return raw[skip : skip + rows * columns].reshape(rows, columns)
+    return raw[skip : skip + count].reshape(shape)
 
 
 def sample_buffer(slots: int, width: int) -> np.ndarray:
     """Return room for the samples of so many bands of a picture of that width [pixel]."""
-    return np.zeros((slots, BAND, (width + 3) // 4, 16), np.int64)
+    return _aligned((slots, BAND, (width + 3) // 4, 2 * BLOCK), np.int32)
+
+
+def row_length(width: int) -> int:
+    """Return room for the fragments of a row of pixels: an odd number of cache lines, that tables spread in the cache."""
+    return 16 * (width // 4 + 1 | 1)
 
 
 def buffers(n: int, t: int, width: int, height: int, slots: int) -> Frame:
-    """Return the buffers for n vertices, t triangles and a picture of that size [pixel].
-
-    slots : bands whose samples are kept at a time: one a thread, or all bands if `coverage_pass` is to keep them
-    """
+    """Return the buffers for n vertices, t triangles and a picture of that size [pixel], drawn by `slots` threads."""
     bands = -(-height // BAND)
     return Frame(
-        facet=np.zeros((t, 3), np.float32),
         eye=np.zeros((n, 3)),
         screen=np.zeros((n, 2), np.int32),
-        vertex=_aligned(n, 8, np.float32),
-        plane=_aligned(t, 16, np.float32),
-        deep=_aligned(t, 8, np.float64),
-        box=np.zeros((t, 4), np.int32),
+        vertex=_aligned((n, 8), np.float32),
+        plane=_aligned((t, 16), np.float32),
+        deep=_aligned((t, 4), np.float64),
+        corner=_aligned((t, 8), np.int32),
+        box=_aligned((t, 8), np.int32),
+        rank=np.zeros(t, np.int32),
         sample=sample_buffer(slots, width),
+        least=np.zeros((slots, BAND, (width + 3) // 4), np.int32),
+        lane=_aligned((slots, 4, BLOCK), np.int32),
         nearest=np.zeros((height, width), np.int32),
-        row_start=np.zeros(bands + 1, np.int32),
+        row_start=np.zeros(2 * bands + 1, np.int32),
         row_list=np.zeros(4 * t + 64, np.int32),
-        fragment=np.zeros((height, N_WHOLE, 4 * width), np.int32),
+        fragment=np.zeros((height, N_WHOLE, row_length(width)), np.int32),
         found=np.zeros(height, np.int32),
     )
 
@@ -145,29 +164,28 @@ class Paint(NamedTuple):
     background: np.ndarray
 
 
-M_RED, M_GREEN, M_BLUE = 0, 1, 2
-M_SOURCE = 3  # 0 uniform colour, 1 texture, 2 colour per vertex
-M_TEXTURE = 4
-M_SPECULAR = 5  # reflectance at normal incidence
-M_ROUGH = 6  # squared roughness of the highlight
-M_WRAP = 7  # 7, 8, 9: how far diffuse light wraps round, red, green, blue
-M_SIDED = 10  # 0 front only, 1 both
-M_BACK = 11  # brightness of the back side
-M_SHADE_RADIUS = 12  # [mm] radius of the screen-space contact shade, 0 = none
-M_SHADE = 13  # its strength
-M_WIRE = 14  # line width [pixel], 0 = none
-M_FLAT = 15  # 0 lit, 1 unlit
-M_LAYER = 16
-M_GLOW = 17  # 17, 18, 19: light that reaches closed places all the same, red, green, blue
-M_MATTE = 20  # how much less the dark parts (hair on skin) shine
-N_MATERIAL = 21
+M_SOURCE = 0  # 0 uniform colour, 1 texture, 2 colour per vertex
+M_TEXTURE = 1
+M_SPECULAR = 2  # reflectance at normal incidence
+M_ROUGH = 3  # squared roughness of the highlight
+M_WRAP = 4  # 4, 5, 6: how far diffuse light wraps round, red, green, blue
+M_SIDED = 7  # 0 front only, 1 both
+M_BACK = 8  # brightness of the back side
+M_SHADE_RADIUS = 9  # [mm] radius of the screen-space contact shade, 0 = none
+M_SHADE = 10  # its strength
+M_WIRE = 11  # line width [pixel], 0 = none
+M_FLAT = 12  # 0 lit, 1 unlit
+M_LAYER = 13
+M_GLOW = 14  # 14, 15, 16: light that reaches closed places all the same, red, green, blue
+M_MATTE = 17  # how much less the dark parts (hair on skin) shine
+N_MATERIAL = 18
 
 LIGHTS = 3
 ENCODE = 8192
 ENCODE_TOP = 2.0
 """The encoding table spans linear values [0, ENCODE_TOP)."""
 
-P_MIP, P_NORMAL, P_SIDE = 9, 10, 13
+P_MIP, P_SIDE = 9, 10
 W_PIXEL, W_TRIANGLE, W_SAMPLES, N_WHOLE = 0, 1, 2, 3
 
 # Samples of one item in one pixel share a colour if their depths differ by less than a part of 1/1024, or by less than
@@ -191,22 +209,7 @@ def carry(rest, pose, out):
             out[i, r] = pose[r, 0] * x + pose[r, 1] * y + pose[r, 2] * z + pose[r, 3]
 
 
-@kernel(parallel=True)
-def facet_pass(moved, mesh, points, frame):
-    """Normals of the triangles of moved items, scaled by twice their area, in the frame of `points` (n, 3) [mm]."""
-    triangle, item, facet = mesh.triangle, mesh.item, frame.facet
-    for t in prange(triangle.shape[0]):
-        if not moved[item[t]]:
-            continue
-        a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
-        ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-        facet[t, 0] = uy * vz - uz * vy
-        facet[t, 1] = uz * vx - ux * vz
-        facet[t, 2] = ux * vy - uy * vx
-
-
-@kernel
+@kernel(inline=True)
 def project(camera, x, y, z):
     """Screen position [1/256 pixel, rounded] of a camera-space point; x is BEHIND if it lies before the near plane."""
     if z < camera[C_NEAR]:
@@ -217,29 +220,47 @@ def project(camera, x, y, z):
     return np.int64(np.floor(sx * SUB + 0.5)), np.int64(np.floor(sy * SUB + 0.5))
 
 
-@kernel(parallel=True)
-def vertex_pass(moved, mesh, points, camera, frame):
-    """Normals, places in camera space and on the screen of moved items' vertices; `points` (n, 3) must be finite."""
-    start, incident, owner, facet = mesh.start, mesh.incident, mesh.owner, frame.facet
+@kernel(inline=True)
+def _normal(i, origin, start, fan, points):
+    """Sum of the normals of the triangles around vertex i, scaled by twice their area [mm^2]."""
+    p = origin[i]
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+    nx, ny, nz = 0.0, 0.0, 0.0
+    for k in range(start[i], start[i + 1]):
+        b, c = fan[k, 0], fan[k, 1]
+        ux, uy, uz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
+        vx, vy, vz = points[c, 0] - x, points[c, 1] - y, points[c, 2] - z
+        nx += uy * vz - uz * vy
+        ny += uz * vx - ux * vz
+        nz += ux * vy - uy * vx
+    return nx, ny, nz
+
+
+@kernel
+def place_pass(moved, mesh, points, camera, frame, shadow):
+    """Normals and places in camera space, on the screen and in the shadow map of moved items' vertices.
+
+    points : (p, 3) [mm], finite
+    """
+    start, fan, owner, origin = mesh.start, mesh.fan, mesh.owner, mesh.origin
     eye, screen, vertex = frame.eye, frame.screen, frame.vertex
-    for i in prange(points.shape[0]):
+    casts, to_map, spot = shadow.casts, shadow.to_map, shadow.spot
+    for i in range(owner.shape[0]):
         if not moved[owner[i]]:
             continue
-        nx, ny, nz = 0.0, 0.0, 0.0
-        for k in range(start[i], start[i + 1]):
-            t = incident[k]
-            nx += facet[t, 0]
-            ny += facet[t, 1]
-            nz += facet[t, 2]
+        nx, ny, nz = _normal(i, origin, start, fan, points)
         scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
-        dx = points[i, 0] - camera[C_POSITION]
-        dy = points[i, 1] - camera[C_POSITION + 1]
-        dz = points[i, 2] - camera[C_POSITION + 2]
+        p = origin[i]
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        dx, dy, dz = x - camera[C_POSITION], y - camera[C_POSITION + 1], z - camera[C_POSITION + 2]
         for r in range(3):
             vertex[i, r] = scale * (camera[3 * r] * nx + camera[3 * r + 1] * ny + camera[3 * r + 2] * nz)
             eye[i, r] = camera[3 * r] * dx + camera[3 * r + 1] * dy + camera[3 * r + 2] * dz
         vertex[i, 7] = eye[i, 2]
         screen[i, 0], screen[i, 1] = project(camera, eye[i, 0], eye[i, 1], eye[i, 2])
+        if casts[owner[i]]:
+            for r in range(3):
+                spot[i, r] = to_map[r, 0] * x + to_map[r, 1] * y + to_map[r, 2] * z + to_map[r, 3]
 
 
 # ----------------------------------------------------------------------------------------------------- triangles
@@ -274,8 +295,25 @@ def _clip(camera, eye, screen, a, b, c):
     return xa, ya, np.int64(screen[b, 0]), np.int64(screen[b, 1]), x2, y2, x3, y3
 
 
-@kernel
-def _planes(camera, eye, a, b, c, t, plane, deep):
+@kernel(inline=True)
+def _corners(camera, eye, screen, a, b, c):
+    """Corners on the screen of a triangle as (x0, y0, ..., x3, y3); the last two are one unless the near plane cuts it.
+
+    A triangle wholly before the near plane has no extent.
+    """
+    x0, y0 = np.int64(screen[a, 0]), np.int64(screen[a, 1])
+    x1, y1 = np.int64(screen[b, 0]), np.int64(screen[b, 1])
+    x2, y2 = np.int64(screen[c, 0]), np.int64(screen[c, 1])
+    x3, y3 = x2, y2
+    if min(x0, x1, x2) == BEHIND:
+        if max(x0, x1, x2) == BEHIND:
+            return x0, y0, x0, y0, x0, y0, x0, y0
+        x0, y0, x1, y1, x2, y2, x3, y3 = _clip(camera, eye, screen, a, b, c)
+    return x0, y0, x1, y1, x2, y2, x3, y3
+
+
+@kernel(inline=True)
+def _planes(camera, eye, a, b, c, t, plane, deep, box):
     """Fill the plane equations of triangle t; return its determinant, zero if it is seen edge-on."""
     ax, ay, az = eye[a, 0], eye[a, 1], eye[a, 2]
     bx, by, bz = eye[b, 0], eye[b, 1], eye[b, 2]
@@ -296,21 +334,12 @@ def _planes(camera, eye, a, b, c, t, plane, deep):
     gx, gy = min(max(gx, -STEEPEST), STEEPEST), min(max(gy, -STEEPEST), STEEPEST)
     deep[t, 0], deep[t, 1] = 8.0 * np.floor(0.125 * gx), 8.0 * np.floor(0.125 * gy)
     deep[t, 2] = s * (e0z + e1z + e2z) * unit - gx * camera[C_X] - gy * camera[C_Y]
-    deep[t, 3] = max(unit / max(az, bz, cz), float(1 << FINE))
-    deep[t, 4] = unit / max(min(az, bz, cz), camera[C_NEAR])
+    unit = DEEPEST * camera[C_NEAR]
+    box[t, 4], box[t, 5] = max(unit / max(az, bz, cz), 1.0), unit / max(min(az, bz, cz), camera[C_NEAR])
     return det
 
 
-@kernel
-def _mip(uv, t, width, height, area):
-    """Mip level at which one texel of triangle t covers about one pixel; area [pixel^2]."""
-    ux, uy = uv[t, 2] - uv[t, 0], uv[t, 3] - uv[t, 1]
-    vx, vy = uv[t, 4] - uv[t, 0], uv[t, 5] - uv[t, 1]
-    texels = abs(ux * vy - uy * vx) * width * height
-    return 0.5 * np.log2(max(texels, 1e-12) / max(area, 1e-3))
-
-
-@kernel
+@kernel(inline=True)
 def _holds_sample(left, right, top, bottom):
     """Whether a box, relative to the corner of a pixel [1/256 pixel], holds one of the pixel's four samples."""
     a, b, c, d = HALF - REACH, HALF - REACH // 3, HALF + REACH // 3, HALF + REACH
@@ -322,109 +351,90 @@ def _holds_sample(left, right, top, bottom):
     )
 
 
+@kernel(inline=True)
+def _box(x0, y0, x1, y1, x2, y2, x3, y3, width, height):
+    """First and last pixel in x and y of which a sample may lie between these corners; empty if there is none."""
+    left, right = min(x0, x1, x2, x3), max(x0, x1, x2, x3)
+    top, bottom = min(y0, y1, y2, y3), max(y0, y1, y2, y3)
+    lo_x, hi_x = max((left - HALF - REACH + SUB - 1) >> 8, 0), min((right - HALF + REACH) >> 8, width - 1)
+    lo_y, hi_y = max((top - HALF - REACH + SUB - 1) >> 8, 0), min((bottom - HALF + REACH) >> 8, height - 1)
+    if lo_x == hi_x and lo_y == hi_y:
+        if not _holds_sample(left - SUB * lo_x, right - SUB * lo_x, top - SUB * lo_y, bottom - SUB * lo_y):
+            return np.int64(1), np.int64(0), np.int64(1), np.int64(0)
+    return np.int64(lo_x), np.int64(hi_x), np.int64(lo_y), np.int64(hi_y)
+
+
 @kernel
-def _set_up(
-    first, last, layer, moved, camera, triangle, item, uv, eye, screen, facet, plane, deep, box, material, level
-):
-    """`setup_pass` for triangles first..last-1."""
+def _set_up_piece(piece, layer, moved, camera, mesh, frame, paint):
+    """`setup_pass` for every PIECES-th chunk of triangles."""
+    triangle, item, texels, material = mesh.triangle, mesh.item, mesh.texels, paint.material
+    eye, screen, plane, deep = frame.eye, frame.screen, frame.plane, frame.deep
+    corner, box, rank = frame.corner, frame.box, frame.rank
     width, height = int(2.0 * camera[C_X]), int(2.0 * camera[C_Y])
-    for t in range(first, last):
-        m = item[t]
-        if not moved[m]:
-            continue
-        box[t, 2], box[t, 3] = 1, 0
-        a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
-        if material[m, M_LAYER] != layer:
-            continue
-        x0, y0 = np.int64(screen[a, 0]), np.int64(screen[a, 1])
-        x1, y1 = np.int64(screen[b, 0]), np.int64(screen[b, 1])
-        x2, y2 = np.int64(screen[c, 0]), np.int64(screen[c, 1])
-        x3, y3 = x2, y2
-        if min(x0, x1, x2) == BEHIND:
-            if max(x0, x1, x2) == BEHIND:
+    for first in range(piece * CHUNK, triangle.shape[0], PIECES * CHUNK):
+        for t in range(first, min(first + CHUNK, triangle.shape[0])):
+            m = item[t]
+            if not moved[m]:
                 continue
-            x0, y0, x1, y1, x2, y2, x3, y3 = _clip(camera, eye, screen, a, b, c)
-        # Twice the area on the screen, whose y points down, so that a front has a negative sign.
-        area = (x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)
-        if area == 0 or (area > 0 and material[m, M_SIDED] == 0.0):
-            continue
-        lo_x = max((min(x0, x1, x2, x3) - HALF - REACH + SUB - 1) >> 8, 0)
-        hi_x = min((max(x0, x1, x2, x3) - HALF + REACH) >> 8, width - 1)
-        lo_y = max((min(y0, y1, y2, y3) - HALF - REACH + SUB - 1) >> 8, 0)
-        hi_y = min((max(y0, y1, y2, y3) - HALF + REACH) >> 8, height - 1)
-        if lo_x > hi_x or lo_y > hi_y:
-            continue
-        if lo_x == hi_x and lo_y == hi_y:
-            left, right, top, bottom = (
-                min(x0, x1, x2, x3),
-                max(x0, x1, x2, x3),
-                min(y0, y1, y2, y3),
-                max(y0, y1, y2, y3),
-            )
-            if not _holds_sample(left - SUB * lo_x, right - SUB * lo_x, top - SUB * lo_y, bottom - SUB * lo_y):
+            rank[t] = 0
+            if material[m, M_LAYER] != layer:
                 continue
-        if _planes(camera, eye, a, b, c, t, plane, deep) == 0.0:
-            continue
-        nx, ny, nz = facet[t, 0], facet[t, 1], facet[t, 2]
-        scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
-        plane[t, P_NORMAL], plane[t, P_NORMAL + 1], plane[t, P_NORMAL + 2] = scale * nx, scale * ny, scale * nz
-        plane[t, P_SIDE] = deep[t, 5] = 1.0 if area < 0 else -1.0
-        if material[m, M_SOURCE] == 1.0:
-            k = int(material[m, M_TEXTURE])
-            plane[t, P_MIP] = _mip(uv, t, level[k, 0, 1], level[k, 0, 2], 0.5 * abs(area) / (SUB * SUB))
-        box[t, 0], box[t, 1], box[t, 2], box[t, 3] = lo_x, hi_x, lo_y, hi_y
+            a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
+            x0, y0, x1, y1, x2, y2, x3, y3 = _corners(camera, eye, screen, a, b, c)
+            # Twice the area on the screen, whose y points down, so that a front has a negative sign.
+            area = (x2 - x0) * (y3 - y1) - (x3 - x1) * (y2 - y0)
+            if area == 0 or (area > 0 and material[m, M_SIDED] == 0.0):
+                continue
+            lo_x, hi_x, lo_y, hi_y = _box(x0, y0, x1, y1, x2, y2, x3, y3, width, height)
+            if lo_x > hi_x or lo_y > hi_y or _planes(camera, eye, a, b, c, t, plane, deep, box) == 0.0:
+                continue
+            plane[t, P_SIDE] = 1.0 if area < 0 else -1.0
+            if material[m, M_SOURCE] == 1.0:
+                plane[t, P_MIP] = 0.5 * (texels[t] - np.log2(max(0.5 * abs(area) / (SUB * SUB), 1e-3)))
+            box[t, 0], box[t, 1], box[t, 2], box[t, 3] = lo_x, hi_x, lo_y, hi_y
+            if area > 0:
+                x1, y1, x3, y3 = x3, y3, x1, y1
+            corner[t, 0], corner[t, 1], corner[t, 2], corner[t, 3] = x0, y0, x1, y1
+            corner[t, 4], corner[t, 5], corner[t, 6], corner[t, 7] = x2, y2, x3, y3
+            rank[t] = (1 if area < 0 and m == item[0] else 2) | lo_y // BAND << 2 | hi_y // BAND << 17
 
 
 @kernel(parallel=True)
-def setup_pass(moved, mesh, camera, layer, frame, paint):
-    """Cull the triangles of moved items in one layer; fill planes, mip levels and boxes of those that may be seen."""
-    triangle, item, uv, eye, screen, facet = mesh.triangle, mesh.item, mesh.uv, frame.eye, frame.screen, frame.facet
-    plane, deep, box, material, level = frame.plane, frame.deep, frame.box, paint.material, paint.level
-    chunks = (triangle.shape[0] + CHUNK - 1) // CHUNK
-    for k in prange(chunks):
-        last = min((k + 1) * CHUNK, triangle.shape[0])
-        _set_up(
-            k * CHUNK,
-            last,
-            layer,
-            moved,
-            camera,
-            triangle,
-            item,
-            uv,
-            eye,
-            screen,
-            facet,
-            plane,
-            deep,
-            box,
-            material,
-            level,
-        )
+def setup_pass(layer, moved, camera, mesh, frame, paint, cast, shadow):
+    """Cull the triangles of moved items in one layer; fill planes, mip levels and boxes of those that may be seen.
+
+    cast : whether to draw the depth seen from the key light as well
+    """
+    for piece in prange(PIECES):
+        _set_up_piece(piece, layer, moved, camera, mesh, frame, paint)
+        if cast:
+            cast_piece(piece, shadow)
 
 
 @kernel
 def band_pass(frame):
-    """Sort visible triangles into bands of rows, by index within a band; return the length the list needs."""
-    box, row_start, row_list = frame.box, frame.row_start, frame.row_list
-    bands = row_start.shape[0] - 1
-    for k in range(bands + 1):
-        row_start[k] = 0
-    for t in range(box.shape[0]):
-        if box[t, 3] >= box[t, 2]:
-            for k in range(box[t, 2] // BAND, box[t, 3] // BAND + 1):
-                row_start[k + 1] += 1
-    for k in range(bands):
+    """Sort visible triangles by band of rows, rank and index; return the length the list needs."""
+    rank, row_start, row_list = frame.rank, frame.row_start, frame.row_list
+    bins = row_start.shape[0] - 1
+    row_start[:] = 0
+    for t in range(rank.shape[0]):
+        r = rank[t]
+        if r > 0:
+            for k in range((r >> 2) & 0x7FFF, (r >> 17) + 1):
+                row_start[2 * k + (r & 3)] += 1
+    for k in range(bins):
         row_start[k + 1] += row_start[k]
-    need = row_start[bands]
+    need = row_start[bins]
     if need > row_list.shape[0]:
         return need
-    for t in range(box.shape[0]):
-        if box[t, 3] >= box[t, 2]:
-            for k in range(box[t, 2] // BAND, box[t, 3] // BAND + 1):
-                row_list[row_start[k]] = t
-                row_start[k] += 1
-    for k in range(bands, 0, -1):
+    for t in range(rank.shape[0]):
+        r = rank[t]
+        if r > 0:
+            for k in range((r >> 2) & 0x7FFF, (r >> 17) + 1):
+                at = 2 * k + (r & 3) - 1
+                row_list[row_start[at]] = t
+                row_start[at] += 1
+    for k in range(bins, 0, -1):
         row_start[k] = row_start[k - 1]
     row_start[0] = 0
     return need
@@ -448,164 +458,226 @@ def _largest(a, b):
 
 
 @kernel
-def _hidden(lo_u, hi_u, lo_y, hi_y, base, most, sample):
-    """Whether every sample of these blocks already shows something nearer than the depth number `most` (fine)."""
-    key = (most >> FINE) << 32
-    for y in range(lo_y, hi_y + 1):
-        for u in range(lo_u, hi_u + 1):
-            least = sample[y - base, u, 0]
-            for q in range(1, 16):
-                s = sample[y - base, u, q]
-                least = s if s < least else least
-            if least <= key + LAST_NAME:
+def _least(lo, hi, sample, least):
+    """Note the smallest depth number in each block lo..hi of a band, so that what lies behind can be left out."""
+    for y in range(BAND):
+        for u in range(lo, hi + 1):
+            low = sample[y, u, 0]
+            for q in range(1, BLOCK):
+                s = sample[y, u, q]
+                low = s if s < low else low
+            least[y, u] = low
+
+
+@kernel(inline=True)
+def _hidden(lo, hi, first, last, most, least):
+    """Whether nothing at most as near as the depth number `most` can be seen in these blocks."""
+    for y in range(first, last + 1):
+        for u in range(lo, hi + 1):
+            if least[y, u] < most:
                 return False
     return True
 
 
-@kernel
-def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, base, sample):
-    """Write the samples of one screen triangle (positive orientation) that are nearer than what is there.
+@kernel(inline=True)
+def _fill_lanes(dx0, dy0, dx1, dy1, dx2, dy2, gx, gy, lane):
+    """Change of edge functions and depth number from the start of a block to each of its samples; see `_cover`."""
+    for q in range(BLOCK):
+        right, down = _RIGHT[q], _DOWN[q]
+        lane[0, q] = dy0 * right - dx0 * down
+        lane[1, q] = dy1 * right - dx1 * down
+        lane[2, q] = dy2 * right - dx2 * down
+        lane[3, q] = min(max((gx * right + gy * down) >> FINE, -TOP), TOP)
 
-    z : depth number at the centre of pixel (lo_x, lo_y), gx, gy its steps   name : LAST_NAME - triangle
-    base : first row of `sample`
-    Four pixels, 16 samples, are tested at a time; the larger of old and new sample stays.
+
+@kernel(inline=True)
+def _cover_block(e0, e1, e2, z, low, high, name, lane, row, u, sample):
+    """Write the samples of block u of a row; edge functions and depth number hold at its start."""
+    for q in range(BLOCK):
+        s0, s1, s2 = np.int32(e0 + lane[0, q]), np.int32(e1 + lane[1, q]), np.int32(e2 + lane[2, q])
+        near = np.int32(z + lane[3, q])
+        near = near if near > low else low
+        near = near if near < high else high
+        near = near if (s0 | s1 | s2) >= 0 else np.int32(0)
+        old, other = sample[row, u, q], sample[row, u, BLOCK + q]
+        sample[row, u, BLOCK + q] = name if near > old else other
+        sample[row, u, q] = near if near > old else old
+
+
+@kernel(inline=True)
+def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, t, base, lane, sample):
+    """Write the samples of screen triangle t (positive orientation) that are nearer than what is there.
+
+    z : fine depth number at the centre of pixel (lo_x & ~3, lo_y), gx, gy its steps   least, most : its limits
+    base : first row of `sample`   lane : (4, BLOCK) work space
+    Edge functions are whole numbers of 32 units between samples, so that floor(e / 32) tells their sides exactly; this
+    lets a block be tested in 32-bit lanes. Edges longer than 2^LONG are rounded a little more.
     """
     lo_x &= ~3
-    a0, b0 = (y1 - y0) * SUB, (x0 - x1) * SUB
-    a1, b1 = (y2 - y1) * SUB, (x1 - x2) * SUB
-    a2, b2 = (y0 - y2) * SUB, (x2 - x0) * SUB
-    i0, j0, i1, j1, i2, j2, ix, iy = a0 >> 3, b0 >> 3, a1 >> 3, b1 >> 3, a2 >> 3, b2 >> 3, gx >> 3, gy >> 3
-    m0, m1, m2 = _largest(i0, j0), _largest(i1, j1), _largest(i2, j2)
+    dx0, dy0, dx1, dy1, dx2, dy2 = x1 - x0, y1 - y0, x2 - x1, y2 - y1, x0 - x2, y0 - y2
+    shift = 0
+    while max(abs(dx0), abs(dy0), abs(dx1), abs(dy1), abs(dx2), abs(dy2)) >> shift >= 1 << LONG:
+        shift += 1
+    d0, d1, d2, d3, d4, d5 = dx0 >> shift, dy0 >> shift, dx1 >> shift, dy1 >> shift, dx2 >> shift, dy2 >> shift
+    _fill_lanes(d0, d1, d2, d3, d4, d5, gx >> 3, gy >> 3, lane)
+    m0, m1, m2 = _largest(dy0, -dx0), _largest(dy1, -dx1), _largest(dy2, -dx2)
     px, py = lo_x * SUB + HALF, lo_y * SUB + HALF
     r0, r1, r2 = _edge(x0, y0, x1, y1, px, py), _edge(x1, y1, x2, y2, px, py), _edge(x2, y2, x0, y0, px, py)
-    a0, a1, a2, gx = 4 * a0, 4 * a1, 4 * a2, 4 * gx
+    r0, r1, r2 = r0 >> 5, r1 >> 5, r2 >> 5
+    name = np.int32(t)
     for y in range(lo_y, hi_y + 1):
-        e0, e1, e2, d = r0, r1, r2, z
+        e0, e1, e2, d, inside = r0, r1, r2, z, False
         for u in range(lo_x >> 2, (hi_x >> 2) + 1):
             if ((e0 + m0) | (e1 + m1) | (e2 + m2)) >= 0:
-                for q in range(16):
-                    right, down = _RIGHT[q], _DOWN[q]
-                    e = (e0 + i0 * right + j0 * down) | (e1 + i1 * right + j1 * down) | (e2 + i2 * right + j2 * down)
-                    near = d + ix * right + iy * down
-                    near = near if near > least else least
-                    near = near if near < most else most
-                    key = ((near >> FINE) << 32) | name
-                    key = key if e >= 0 else 0
-                    old = sample[y - base, u, q]
-                    sample[y - base, u, q] = key if key > old else old
-            e0 += a0
-            e1 += a1
-            e2 += a2
-            d += gx
-        r0 += b0
-        r1 += b1
-        r2 += b2
+                f0, f1, f2 = (
+                    np.int32(min(e0 >> shift, TOP)),
+                    np.int32(min(e1 >> shift, TOP)),
+                    np.int32(min(e2 >> shift, TOP)),
+                )
+                f3 = np.int32(min(max(d >> FINE, -TOP), TOP))
+                _cover_block(f0, f1, f2, f3, least, most, name, lane, y - base, u, sample)
+                inside = True
+            elif inside:
+                break
+            e0 += 32 * dy0
+            e1 += 32 * dy1
+            e2 += 32 * dy2
+            d += 4 * gx
+        r0 -= 8 * dx0
+        r1 -= 8 * dx1
+        r2 -= 8 * dx2
         z += gy
 
 
 @kernel(inline=True)
-def _triangle(sample):
-    return LAST_NAME - (sample & LAST_NAME)
+def _draw_triangle(t, first, last, ranked, corner, box, deep, lane, least, sample):
+    """Draw triangle t into the rows first..last of a band; if it is `ranked` second, ask first whether it is hidden."""
+    lo_x, hi_x = np.int64(box[t, 0]), np.int64(box[t, 1])
+    lo_y, hi_y = max(np.int64(box[t, 2]), first), min(np.int64(box[t, 3]), last)
+    low, most = box[t, 4], box[t, 5]
+    if ranked and _hidden(lo_x >> 2, hi_x >> 2, lo_y - first, hi_y - first, most, least):
+        return
+    x0, y0, x1, y1 = np.int64(corner[t, 0]), np.int64(corner[t, 1]), np.int64(corner[t, 2]), np.int64(corner[t, 3])
+    x2, y2, x3, y3 = np.int64(corner[t, 4]), np.int64(corner[t, 5]), np.int64(corner[t, 6]), np.int64(corner[t, 7])
+    gx, gy = np.int64(deep[t, 0]), np.int64(deep[t, 1])
+    z = np.int64(deep[t, 2] + deep[t, 0] * ((lo_x & ~3) + 0.5) + deep[t, 1] * (lo_y + 0.5))
+    for _ in range(2):
+        if (x0 != x1 or y0 != y1) and (x1 != x2 or y1 != y2):
+            _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, low, most, t, first, lane, sample)
+        x1, y1, x2, y2 = x2, y2, x3, y3
 
 
 @kernel
-def _alike(si, sj, item, plane):
-    """Whether two samples of a pixel may share one colour."""
-    t, k = _triangle(si), _triangle(sj)
-    near = (abs((si >> 32) - (sj >> 32)) <= SAME_DEPTH * (si >> 32)) & (item[t] == item[k])
-    turn = plane[t, P_NORMAL] * plane[k, P_NORMAL] + plane[t, P_NORMAL + 1] * plane[k, P_NORMAL + 1]
-    return near & (turn + plane[t, P_NORMAL + 2] * plane[k, P_NORMAL + 2] >= SAME_TURN)
+def _cover_band(band, lo, hi, height, frame, lane, least, sample):
+    """Clear the blocks lo..hi of one band of rows and draw its triangles into it, those of the first rank first."""
+    corner, box, deep, row_start, row_list = frame.corner, frame.box, frame.deep, frame.row_start, frame.row_list
+    first = band * BAND
+    last = min(first + BAND, height) - 1
+    sample[:, lo : hi + 1] = 0
+    for ranked in range(2):
+        if ranked:
+            _least(lo, hi, sample, least)
+        for k in range(row_start[2 * band + ranked], row_start[2 * band + ranked + 1]):
+            t = row_list[k]
+            _draw_triangle(t, first, last, ranked, corner, box, deep, lane, least, sample)
 
 
-@kernel
-def _list_row(width, sample, item, plane, whole):
-    """List the fragments of one row of samples (w / 4, 16), from left to right; return how many there are."""
-    n = 0
-    for x in range(width):
-        u, q = x >> 2, 4 * (x & 3)
-        s0, s1, s2, s3 = sample[u, q], sample[u, q + 1], sample[u, q + 2], sample[u, q + 3]
-        if (s0 | s1 | s2 | s3) == 0:
+@kernel(inline=True)
+def _alike(zi, zj, t, k, item, plane):
+    """Whether two samples of a pixel, of triangles t and k with depth numbers zi and zj, may share one colour."""
+    if item[t] != item[k] or abs(zi - zj) > SAME_DEPTH * zi:
+        return False
+    ax, ay, az = plane[t, 0] + plane[t, 3] + plane[t, 6], plane[t, 1] + plane[t, 4] + plane[t, 7], _ahead(plane, t)
+    bx, by, bz = plane[k, 0] + plane[k, 3] + plane[k, 6], plane[k, 1] + plane[k, 4] + plane[k, 7], _ahead(plane, k)
+    turn = plane[t, P_SIDE] * plane[k, P_SIDE] * (ax * bx + ay * by + az * bz)
+    square = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
+    return turn > 0.0 and turn * turn >= SAME_TURN * SAME_TURN * square
+
+
+@kernel(inline=True)
+def _ahead(plane, t):
+    return plane[t, 2] + plane[t, 5] + plane[t, 8]
+
+
+@kernel(inline=True)
+def _split_pixel(x, n, sample, item, plane, whole):
+    """Add the fragments of a pixel that shows several surfaces after the first n of a row; return how many there are."""
+    at, done = 2 * BLOCK * (x >> 2) + 4 * (x & 3), 0
+    for i in range(4):
+        zi, ti = load(sample, at + i), load(sample, at + BLOCK + i)
+        if zi == 0 or (done >> i) & 1:
             continue
-        low, high = min(s0, s1, s2, s3), max(s0, s1, s2, s3)
-        if low > 0 and ((high >> 32) - (low >> 32)) << 10 <= high >> 32:
-            # Nearly always: samples close together on one item. One branch that is easy to foresee costs least.
-            m = item[_triangle(s0)]
-            if (m == item[_triangle(s1)]) & (m == item[_triangle(s2)]) & (m == item[_triangle(s3)]):
-                whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(s0), 4
-                n += 1
-                continue
-        done = 0
-        for i in range(4):
-            si = sample[u, q + i]
-            if si == 0 or (done >> i) & 1:
-                continue
-            count = 1
-            for j in range(i + 1, 4):
-                sj = sample[u, q + j]
-                if sj > 0 and not (done >> j) & 1 and _alike(si, sj, item, plane):
-                    count += 1
-                    done |= 1 << j
-            whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, _triangle(si), count
-            n += 1
+        count = 1
+        for j in range(i + 1, 4):
+            zj, tj = load(sample, at + j), load(sample, at + BLOCK + j)
+            if zj > 0 and not (done >> j) & 1 and _alike(zi, zj, ti, tj, item, plane):
+                count += 1
+                done |= 1 << j
+        whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, ti, count
+        n += 1
     return n
 
 
 @kernel
-def _cover_band(band, height, triangle, eye, screen, box, deep, row_start, row_list, camera, sample):
-    """Clear one band of rows and draw its triangles into it."""
-    first = band * BAND
-    last = min(first + BAND, height) - 1
-    sample[:] = 0
-    for k in range(row_start[band], row_start[band + 1]):
-        t = row_list[k]
-        a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
-        x0, y0 = np.int64(screen[a, 0]), np.int64(screen[a, 1])
-        x1, y1 = np.int64(screen[b, 0]), np.int64(screen[b, 1])
-        x2, y2 = np.int64(screen[c, 0]), np.int64(screen[c, 1])
-        x3, y3 = x2, y2
-        if min(x0, x1, x2) == BEHIND:
-            x0, y0, x1, y1, x2, y2, x3, y3 = _clip(camera, eye, screen, a, b, c)
-        if deep[t, 5] < 0.0:
-            x1, y1, x3, y3 = x3, y3, x1, y1
-        lo_x, hi_x = np.int64(box[t, 0]), np.int64(box[t, 1])
-        lo_y, hi_y = max(np.int64(box[t, 2]), first), min(np.int64(box[t, 3]), last)
-        gx, gy, least, most = np.int64(deep[t, 0]), np.int64(deep[t, 1]), np.int64(deep[t, 3]), np.int64(deep[t, 4])
-        z = np.int64(deep[t, 2] + deep[t, 0] * ((lo_x & ~3) + 0.5) + deep[t, 1] * (lo_y + 0.5))
-        name = np.int64(LAST_NAME - t)
-        lo_u, hi_u = lo_x >> 2, hi_x >> 2
-        if (hi_u - lo_u + 1) * (hi_y - lo_y + 1) <= FEW and _hidden(lo_u, hi_u, lo_y, hi_y, first, most, sample):
+def _list_row(lo, hi, sample, item, plane, whole, nearest):
+    """List the fragments of blocks lo..hi of a row of samples, from left to right; return how many there are."""
+    n = 0
+    nearest[:] = 0
+    for x in range(4 * lo, min(4 * hi + 4, nearest.shape[0])):
+        at = 2 * BLOCK * (x >> 2) + 4 * (x & 3)
+        z0, z1, z2, z3 = load(sample, at), load(sample, at + 1), load(sample, at + 2), load(sample, at + 3)
+        low, high = min(z0, z1, z2, z3), max(z0, z1, z2, z3)
+        if high == 0:
             continue
-        if (x0 != x1 or y0 != y1) and (x1 != x2 or y1 != y2):
-            _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, first, sample)
-        if x3 != x2 or y3 != y2:
-            _cover(x0, y0, x2, y2, x3, y3, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, most, name, first, sample)
+        nearest[x] = high
+        at += BLOCK
+        t0, t1, t2, t3 = load(sample, at), load(sample, at + 1), load(sample, at + 2), load(sample, at + 3)
+        # Nearly always: samples close together on one item. One branch that is easy to foresee costs least.
+        if low > 0 and (high - low) << 10 <= high:
+            m = load(item, t0)
+            if (m == load(item, t1)) & (m == load(item, t2)) & (m == load(item, t3)):
+                whole[W_PIXEL, n], whole[W_TRIANGLE, n], whole[W_SAMPLES, n] = x, t0, 4
+                n += 1
+                continue
+        n = _split_pixel(x, n, sample, item, plane, whole)
+    return n
 
 
 @kernel
-def _list_band(band, item, plane, sample, fragment, found, nearest):
-    """List the fragments of one band of rows and note the nearest depth of each pixel."""
-    height, width = nearest.shape
-    first = band * BAND
-    for y in range(first, min(first + BAND, height)):
-        found[y] = _list_row(width, sample[y - first], item, plane, fragment[y])
-        for x in range(width):
-            u, q = x >> 2, 4 * (x & 3)
-            s = sample[y - first]
-            nearest[y, x] = max(s[u, q], s[u, q + 1], s[u, q + 2], s[u, q + 3]) >> 32
+def _extent(band, row_start, row_list, box, width):
+    """First and last block of four pixels that the triangles of a band may touch."""
+    lo, hi = width, -1
+    for k in range(row_start[2 * band], row_start[2 * band + 2]):
+        lo, hi = min(lo, box[row_list[k], 0]), max(hi, box[row_list[k], 1])
+    return lo >> 2, hi >> 2
+
+
+@kernel
+def _cover_and_list(band, slot, listed, item, frame):
+    """`coverage_pass` for one band, by the thread of that slot."""
+    width, height = frame.nearest.shape[1], frame.nearest.shape[0]
+    sample = frame.sample[slot if listed else band]
+    lo, hi = 0, sample.shape[1] - 1
+    if listed:
+        lo, hi = _extent(band, frame.row_start, frame.row_list, frame.box, width)
+    _cover_band(band, lo, hi, height, frame, frame.lane[slot], frame.least[slot], sample)
+    if listed:
+        plane, fragment, found, nearest = frame.plane, frame.fragment, frame.found, frame.nearest
+        for y in range(band * BAND, min((band + 1) * BAND, height)):
+            found[y] = _list_row(lo, hi, sample[y - band * BAND], item, plane, fragment[y], nearest[y])
 
 
 @kernel(parallel=True)
-def coverage_pass(order, listed, mesh, camera, frame):
-    """Find the nearest triangle of every sample, band by band; `order` (bands,) deals the bands out to the threads.
+def coverage_pass(order, listed, item, frame, shadow):
+    """Find the nearest triangle of every sample, band by band, and blur the shadow's depth, strip by strip.
 
+    order : (k,) deals out the work to the threads: bands, then strips of the shadow
     listed : list fragments and nearest depths, samples live in the slot of the thread; else keep them, band b in slot b
     """
-    triangle, eye, screen, box, deep = mesh.triangle, frame.eye, frame.screen, frame.box, frame.deep
-    row_start, row_list, sample, height = frame.row_start, frame.row_list, frame.sample, int(2.0 * camera[C_Y])
-    item, plane, fragment, found, nearest = mesh.item, frame.plane, frame.fragment, frame.found, frame.nearest
+    bands = frame.row_start.shape[0] // 2
     for k in prange(order.shape[0]):
-        b = order[k]
-        room = sample[get_thread_id() if listed else b]
-        _cover_band(b, height, triangle, eye, screen, box, deep, row_start, row_list, camera, room)
-        if listed:
-            _list_band(b, item, plane, room, fragment, found, nearest)
+        b, slot = order[k], get_thread_id()
+        if b >= bands:
+            moment_strip(b - bands, shadow)
+        else:
+            _cover_and_list(b, slot, listed, item, frame)

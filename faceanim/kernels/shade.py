@@ -11,8 +11,10 @@ texture and the shadow, light them (vector instructions), add them up. `whole` i
 from __future__ import annotations
 
 import numpy as np
+from numba import get_thread_id  # type: ignore[attr-defined]
 
 from faceanim.ground.jit import kernel, prange
+from faceanim.kernels.lanes import mix8
 from faceanim.kernels.memory import STORE, load
 from faceanim.kernels.raster import (
     BAND,
@@ -24,12 +26,9 @@ from faceanim.kernels.raster import (
     ENCODE,
     ENCODE_TOP,
     M_BACK,
-    M_BLUE,
     M_FLAT,
     M_GLOW,
-    M_GREEN,
     M_MATTE,
-    M_RED,
     M_ROUGH,
     M_SHADE,
     M_SHADE_RADIUS,
@@ -47,13 +46,14 @@ from faceanim.kernels.raster import (
 from faceanim.kernels.shadow import shadow_run
 
 # Rows of the table of attributes.
-A_NX, A_NY, A_NZ, A_OPEN, A_RED, A_GREEN, A_BLUE, A_MIP, A_DEPTH, A_LIT = 0, 1, 2, 3, 4, 5, 6, 7, 8, 9
-A_TEXTURE, A_OUT, N_NUMBER = 10, 13, 16
+A_NX, A_NY, A_NZ, A_OPEN, A_RED, A_GREEN, A_BLUE, A_DEPTH = 0, 1, 2, 3, 4, 5, 6, 7
+A_MIP, A_SIDE, A_LIT, A_TEXTURE, A_OUT, N_NUMBER = 8, 9, 10, 11, 14, 17
 
 _0, _1, _2, _4 = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(4.0)
 _DECODE, _TEN, _SHIFT1, _SHIFT2 = np.float32(1023.0**-2), np.uint32(1023), np.uint32(10), np.uint32(20)
 _HALF, _TINY, _EDGE = np.float32(0.5), np.float32(1e-12), np.float32(0.1)
 _REDDEN, _FIVE, _LEAST = np.float32(0.8), np.float32(5.0), np.float32(1e-30)
+_CODES = np.float32(ENCODE / ENCODE_TOP)
 _SHADED, _BOUNCE, _RIM = np.float32(0.22), np.float32(0.8), np.float32(0.35)
 
 store0, store1, store2 = STORE[0], STORE[1], STORE[2]
@@ -63,40 +63,24 @@ store0, store1, store2 = STORE[0], STORE[1], STORE[2]
 
 
 @kernel
-def _attribute_row(n, ry, centre, focal, triangle, item, uv, vertex, plane, row, whole, number):
-    """Interpolate normal, occlusion and colour (or texture position) of the n fragments of a row, all in float32."""
+def _attribute_row(n, ry, centre, focal, triangle, vertex, plane, whole, number):
+    """Interpolate what the vertices carry at the n fragments of a row, all in float32."""
+    cap, step = number.shape[1], _1 / focal
     for i in range(n):
-        t = whole[W_TRIANGLE, i]
-        m = item[t]
-        rx = (np.float32(whole[W_PIXEL, i]) + _HALF - centre) / focal
+        t = load(whole, W_TRIANGLE * cap + i)
+        p = 16 * t
+        rx = (np.float32(load(whole, W_PIXEL * cap + i)) + _HALF - centre) * step
         # A pixel centre beside a triangle that covers only some samples takes the value of the nearest corner or edge.
-        w0 = max(plane[t, 0] * rx + plane[t, 1] * ry + plane[t, 2], _0)
-        w1 = max(plane[t, 3] * rx + plane[t, 4] * ry + plane[t, 5], _0)
-        w2 = max(plane[t, 6] * rx + plane[t, 7] * ry + plane[t, 8], _0)
+        w0 = max(load(plane, p) * rx + load(plane, p + 1) * ry + load(plane, p + 2), _0)
+        w1 = max(load(plane, p + 3) * rx + load(plane, p + 4) * ry + load(plane, p + 5), _0)
+        w2 = max(load(plane, p + 6) * rx + load(plane, p + 7) * ry + load(plane, p + 8), _0)
         total = _1 / max(w0 + w1 + w2, _LEAST)
         w0, w1, w2 = w0 * total, w1 * total, w2 * total
-        a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
-        side = plane[t, P_SIDE]
-        number[A_NX, i] = side * (w0 * vertex[a, 0] + w1 * vertex[b, 0] + w2 * vertex[c, 0])
-        number[A_NY, i] = side * (w0 * vertex[a, 1] + w1 * vertex[b, 1] + w2 * vertex[c, 1])
-        number[A_NZ, i] = side * (w0 * vertex[a, 2] + w1 * vertex[b, 2] + w2 * vertex[c, 2])
-        open_ = w0 * vertex[a, 3] + w1 * vertex[b, 3] + w2 * vertex[c, 3]
-        number[A_OPEN, i] = open_ if side > _0 else open_ * row[m, M_BACK]
-        number[A_DEPTH, i] = w0 * vertex[a, 7] + w1 * vertex[b, 7] + w2 * vertex[c, 7]
-        number[A_LIT, i] = _1
-        source = row[m, M_SOURCE]
-        if source == _1:
-            number[A_RED, i] = w0 * uv[t, 0] + w1 * uv[t, 2] + w2 * uv[t, 4]
-            number[A_GREEN, i] = w0 * uv[t, 1] + w1 * uv[t, 3] + w2 * uv[t, 5]
-            number[A_MIP, i] = plane[t, P_MIP]
-        elif source == _2:
-            number[A_RED, i] = w0 * vertex[a, 4] + w1 * vertex[b, 4] + w2 * vertex[c, 4]
-            number[A_GREEN, i] = w0 * vertex[a, 5] + w1 * vertex[b, 5] + w2 * vertex[c, 5]
-            number[A_BLUE, i] = w0 * vertex[a, 6] + w1 * vertex[b, 6] + w2 * vertex[c, 6]
-        else:
-            number[A_RED, i] = row[m, M_RED]
-            number[A_GREEN, i] = row[m, M_GREEN]
-            number[A_BLUE, i] = row[m, M_BLUE]
+        a, b, c = 8 * load(triangle, 3 * t), 8 * load(triangle, 3 * t + 1), 8 * load(triangle, 3 * t + 2)
+        mix8(number, i, cap, vertex, a, b, c, w0, w1, w2)
+        store0(number, A_MIP * cap + i, load(plane, p + P_MIP))
+        store0(number, A_SIDE * cap + i, load(plane, p + P_SIDE))
+        store0(number, A_LIT * cap + i, _1)
 
 
 @kernel
@@ -151,7 +135,7 @@ def _bilinear(texel, level, at, u, v):
 
 @kernel
 def _texture_run(first, last, texel, level, table, top, number):
-    """Linear colour of fragments first..last-1 from one texture, mixed between the two mip levels next to A_MIP.
+    """Linear colour of fragments first..last-1 from one texture, at the mip level next to A_MIP.
 
     table : where the texture's first level is described in `level`   top : its last level
     """
@@ -160,14 +144,10 @@ def _texture_run(first, last, texel, level, table, top, number):
         u, v, mip = load(number, A_RED * cap + i), load(number, A_GREEN * cap + i), load(number, A_MIP * cap + i)
         mip = mip if mip > _0 else _0
         mip = mip if mip < top else top
-        low = np.int32(mip)
-        part = mip - np.float32(low)
-        at = table + 3 * low
-        r0, g0, b0 = _bilinear(texel, level, at, u, v)
-        r1, g1, b1 = _bilinear(texel, level, at + (3 if part > _0 else 0), u, v)
-        store0(number, A_TEXTURE * cap + i, (r0 + part * (r1 - r0)) * _DECODE)
-        store1(number, (A_TEXTURE + 1) * cap + i, (g0 + part * (g1 - g0)) * _DECODE)
-        store2(number, (A_TEXTURE + 2) * cap + i, (b0 + part * (b1 - b0)) * _DECODE)
+        red, green, blue = _bilinear(texel, level, table + 3 * np.int32(mip + _HALF), u, v)
+        store0(number, A_TEXTURE * cap + i, red * _DECODE)
+        store1(number, (A_TEXTURE + 1) * cap + i, green * _DECODE)
+        store2(number, (A_TEXTURE + 2) * cap + i, blue * _DECODE)
 
 
 # ------------------------------------------------------------------------------------------------------- 3. light
@@ -201,13 +181,10 @@ def _shine(nx, ny, nz, vx, vy, vz, lx, ly, lz, facing, rough, f0):
 
 @kernel
 def _light_run(first, last, colour, ry, centre, focal, light, ambient, row, whole, number):
-    (
-        """Light fragments first..last-1, all of the material `row`, their colour from column `colour` on.
+    """Light fragments first..last-1, all of the material `row`, their colour from column `colour` on.
 
     light : (3, 6), ambient : (3, 3), all float32
     """
-        ""
-    )
     cap = number.shape[1]
     f0, rough, flat = row[M_SPECULAR], row[M_ROUGH], row[M_FLAT]
     wr, wg, wb = row[M_WRAP], row[M_WRAP + 1], row[M_WRAP + 2]
@@ -219,16 +196,17 @@ def _light_run(first, last, colour, ry, centre, focal, light, ambient, row, whol
     gr, gg, gb = ambient[1, 0], ambient[1, 1], ambient[1, 2]
     br, bg, bb = row[M_GLOW], row[M_GLOW + 1], row[M_GLOW + 2]
     mr, mg, mb = ambient[2, 0], ambient[2, 1], ambient[2, 2]
-    lamp, shiny, matte = _1 - flat, _1 if f0 > _0 else _0, row[M_MATTE]
+    lamp, shiny, matte, back = _1 - flat, _1 if f0 > _0 else _0, row[M_MATTE], row[M_BACK]
     for i in range(first, last):
         nx, ny, nz = load(number, A_NX * cap + i), load(number, A_NY * cap + i), load(number, A_NZ * cap + i)
         square = nx * nx + ny * ny + nz * nz
-        s = _1 / np.sqrt(square if square > _TINY else _TINY)
+        side = load(number, A_SIDE * cap + i)
+        s = side / np.sqrt(square if square > _TINY else _TINY)
         nx, ny, nz = nx * s, ny * s, nz * s
         x = (np.float32(load(whole, W_PIXEL * cap + i)) + _HALF - centre) / focal
         vz = -_1 / np.sqrt(x * x + ry * ry + _1)
         vx, vy = x * vz, ry * vz
-        open_ = load(number, A_OPEN * cap + i)
+        open_ = load(number, A_OPEN * cap + i) * (_1 if side > _0 else back)
         red, green = load(number, colour * cap + i), load(number, (colour + 1) * cap + i)
         blue = load(number, (colour + 2) * cap + i)
         fk = nx * kx + ny * ky + nz * kz
@@ -287,29 +265,63 @@ def _wire_run(first, last, width, ry, camera, plane, whole, number):
 
 @kernel(inline=True)
 def _encode(table, value):
-    return table[min(max(int(value * (ENCODE / ENCODE_TOP)), 0), ENCODE - 1)]
+    """The sRGB byte of linear light."""
+    at = np.int32(value * _CODES)
+    at = at if at > 0 else np.int32(0)
+    return load(table, at if at < ENCODE else np.int32(ENCODE - 1))
+
+
+@kernel(inline=True)
+def _encoded(table, red, green, blue):
+    """Three sRGB bytes in one word, red lowest."""
+    return _encode(table, red) | _encode(table, green) << 8 | _encode(table, blue) << 16
+
+
+@kernel
+def _encode_row(n, table, whole, number):
+    """Put the colours of the n fragments of a row as bytes in place of their triangles."""
+    cap = number.shape[1]
+    for i in range(n):
+        red, green, blue = (
+            load(number, A_OUT * cap + i),
+            load(number, (A_OUT + 1) * cap + i),
+            load(number, (A_OUT + 2) * cap + i),
+        )
+        store0(whole, W_TRIANGLE * cap + i, _encoded(table, red, green, blue))
+
+
+@kernel(inline=True)
+def _fill(first, last, word, row):
+    """Set the pixels first..last-1 of a row to one colour."""
+    red, green, blue = np.uint8(word & 255), np.uint8((word >> 8) & 255), np.uint8(word >> 16)
+    for x in range(first, last):
+        row[x, 0], row[x, 1], row[x, 2] = red, green, blue
 
 
 @kernel
 def _resolve_row(n, back, table, whole, number, row):
     """Write a row of bytes (w, 3): fragments weighted by their samples, over the linear colour `back` (3,)."""
-    b0, b1, b2 = _encode(table, back[0]), _encode(table, back[1]), _encode(table, back[2])
-    i = 0
-    for x in range(row.shape[0]):
-        red, green, blue, rest = 0.0, 0.0, 0.0, 4
-        while i < n and whole[W_PIXEL, i] == x:
-            k = whole[W_SAMPLES, i]
-            red += k * number[A_OUT, i]
-            green += k * number[A_OUT + 1, i]
-            blue += k * number[A_OUT + 2, i]
-            rest -= k
+    r0, g0, b0 = np.float32(back[0]), np.float32(back[1]), np.float32(back[2])
+    empty = _encoded(table, r0, g0, b0)
+    i, end = 0, 0
+    while i < n:
+        x = np.int64(whole[W_PIXEL, i])
+        _fill(end, x, empty, row)
+        end = x + 1
+        if whole[W_SAMPLES, i] == 4:
+            _fill(x, end, whole[W_TRIANGLE, i], row)
             i += 1
-        if rest == 4:
-            row[x, 0], row[x, 1], row[x, 2] = b0, b1, b2
-        else:
-            row[x, 0] = _encode(table, 0.25 * (red + rest * back[0]))
-            row[x, 1] = _encode(table, 0.25 * (green + rest * back[1]))
-            row[x, 2] = _encode(table, 0.25 * (blue + rest * back[2]))
+            continue
+        red, green, blue, rest = _0, _0, _0, _1
+        while i < n and whole[W_PIXEL, i] == x:
+            part = np.float32(0.25) * np.float32(whole[W_SAMPLES, i])
+            red += part * number[A_OUT, i]
+            green += part * number[A_OUT + 1, i]
+            blue += part * number[A_OUT + 2, i]
+            rest -= part
+            i += 1
+        _fill(x, end, _encoded(table, red + rest * r0, green + rest * g0, blue + rest * b0), row)
+    _fill(end, row.shape[0], empty, row)
 
 
 @kernel
@@ -326,13 +338,13 @@ def _blend_row(n, opacity, table, whole, number, row):
 def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number, out):
     """Colour one band of rows; over the background, or over `out` if opacity is not negative."""
     triangle, item, plane, material = mesh.triangle, mesh.item, frame.plane, paint.material
-    row32, table = paint.material32, paint.encode
+    row32, table, bias = paint.material32, paint.encode, np.float32(shadow.bias)
     centre, focal = np.float32(camera[C_X]), np.float32(camera[C_FOCAL])
     for y in range(band * BAND, min((band + 1) * BAND, out.shape[0])):
         ry = (camera[C_Y] - y - 0.5) / camera[C_FOCAL]
         height = np.float32(ry)
         n, whole = frame.found[y], frame.fragment[y]
-        _attribute_row(n, height, centre, focal, triangle, item, mesh.uv, frame.vertex, plane, row32, whole, number)
+        _attribute_row(n, height, centre, focal, triangle, frame.vertex, plane, whole, number)
         first = 0
         while first < n:
             m, last = item[whole[W_TRIANGLE, first]], first + 1
@@ -346,10 +358,11 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
                 top, colour = np.float32(paint.level_count[k] - 1), A_TEXTURE
                 _texture_run(first, last, paint.texel, paint.level, 3 * paint.level.shape[1] * k, top, number)
             light, ambient = paint.light, paint.ambient
-            if shadow.bias > 0.0 and opacity < 0.0:
-                to_light, bias = shadow.to_light, np.float32(shadow.bias)
+            if bias > _0 and opacity < 0.0:
                 places = (W_PIXEL, A_DEPTH, A_LIT)
-                shadow_run(first, last, height, centre, focal, to_light, bias, places, whole, number, shadow.moment)
+                shadow_run(
+                    first, last, height, centre, focal, shadow.to_light, bias, places, whole, number, shadow.moment
+                )
             _light_run(first, last, colour, height, centre, focal, light, ambient, row32[m], whole, number)
             if row[M_WIRE] > 0.0:
                 _wire_run(first, last, row[M_WIRE], ry, camera, plane, whole, number)
@@ -357,6 +370,7 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
         if opacity >= 0.0:
             _blend_row(n, opacity, table, whole, number, out[y])
         else:
+            _encode_row(n, table, whole, number)
             _resolve_row(n, paint.background[y], table, whole, number, out[y])
 
 
@@ -366,8 +380,8 @@ def shade_pass(order, opacity, mesh, camera, frame, paint, shadow, step, number,
 
     opacity : in [0, 1] blends over what `out` holds, negative draws over the background
     shadow : of the key light, bias 0 = none   step : (taps, 3) of the contact shade
-    number : (bands, N_NUMBER, 4 w) work space
+    number : (slots, N_NUMBER, row_length) work space of each thread
     """
     for k in prange(order.shape[0]):
         b = order[k]
-        _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, number[b], out)
+        _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, number[get_thread_id()], out)

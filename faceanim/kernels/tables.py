@@ -143,7 +143,8 @@ class Planes(NamedTuple):
 
     Gap of contact c: normal . (x[node 0] - sum_k weight_k x[node k]) - offset; nodes 1-3 are -1 against rigid things.
 
-    count : (2,) all contacts, and those of lips and lids, which come first   node : (c, 4)   weight, normal : (c, 3)   offset : (c,) [mm]   stiffness : (c,) [mN/mm]
+    count : (2,) all contacts, and those of lips and lids, which come first
+    node : (c, 4)   weight, normal : (c, 3)   offset : (c,) [mm]   stiffness : (c,) [mN/mm]
     What the search for pair contacts remembers from call to call, none of which changes what it finds:
     nearest : (cp,) the triangle nearest to each vertex last time   apart : (cp,) lower bound of the distance [mm]
     before : (n, 3) positions at the last call   ball : (t, 4) bounding spheres of the triangles

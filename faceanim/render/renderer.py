@@ -15,8 +15,11 @@ from faceanim.ground.arrays import Floats, Ints, floats, ints
 from faceanim.ground.errors import RunError, UserError
 from faceanim.kernels import raster, shade
 from faceanim.render.camera import Camera
-from faceanim.render.shading import Bytes, Look, Material, linear, paint_tables
-from faceanim.render.shadow import ShadowMap, no_shadow
+from faceanim.render.shading import Bytes, Look, Material, Texture, linear, paint_tables
+from faceanim.render.shadow import aim, shadow_tables, strips
+
+BAND_COST, STRIP_COST = 60, 80
+"""What clearing and listing a band, and blurring a strip of the shadow, cost, in triangles drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,27 +63,67 @@ class DrawItem:
             )
 
 
-def _incidence(triangles: Ints, n: int) -> tuple[Ints, Ints]:
-    """Triangles around each vertex, as (start (n + 1,), list)."""
-    flat = triangles.ravel()
-    order = np.argsort(flat, kind="stable")
-    start = np.zeros(n + 1, dtype=np.int32)
-    np.cumsum(np.bincount(flat, minlength=n), out=start[1:])
-    return start, np.ascontiguousarray(order // 3, dtype=np.int32)
+def _split(item: DrawItem) -> tuple[Ints, Ints, Floats | None]:
+    """Return vertices of an item that have one place in the texture each: points (n,), triangles (t, 3), uv (n, 2)."""
+    if item.uv is None or item.uv_triangles is None:
+        return np.arange(len(item.points), dtype=np.int32), item.triangles, None
+    pair = np.stack([item.triangles.ravel(), item.uv_triangles.ravel()], axis=1)
+    kept, index = np.unique(pair, axis=0, return_inverse=True)
+    return kept[:, 0].astype(np.int32), index.reshape(-1, 3).astype(np.int32), item.uv[kept[:, 1]]
 
 
-def _joined(items: Sequence[DrawItem], first: Ints) -> raster.Mesh:
-    triangles = np.concatenate([item.triangles + f for item, f in zip(items, first[:-1], strict=True)])
-    uv = np.zeros((len(triangles), 6), dtype=np.float32)
-    at = 0
-    for item in items:
-        if item.uv is not None and item.uv_triangles is not None:
-            uv[at : at + len(item.triangles)] = item.uv[item.uv_triangles].reshape(-1, 6)
-        at += len(item.triangles)
-    start, incident = _incidence(triangles, int(first[-1]))
-    owner = np.repeat(np.arange(len(items), dtype=np.int32), [len(item.triangles) for item in items])
-    holder = np.repeat(np.arange(len(items), dtype=np.int32), np.diff(first))
-    return raster.Mesh(np.ascontiguousarray(triangles, dtype=np.int32), owner, start, incident, holder, uv)
+def _fans(triangles: Ints, count: int) -> tuple[Ints, Ints]:
+    """Opposite edges of the triangles around each point, as (start (count + 1,), list (3 t, 2))."""
+    corner = triangles.ravel()
+    order = np.argsort(corner, kind="stable")
+    start = np.zeros(count + 1, dtype=np.int32)
+    np.cumsum(np.bincount(corner, minlength=count), out=start[1:])
+    edge = np.stack([np.roll(triangles, -1, axis=1).ravel(), np.roll(triangles, -2, axis=1).ravel()], axis=1)
+    return start, np.ascontiguousarray(edge[order], dtype=np.int32)
+
+
+def _texels(triangles: Ints, uv: Floats | None, texture: Texture | None) -> Floats:
+    """Return log2 of the texture's area in each triangle [texel], (t,)."""
+    if uv is None or texture is None:
+        return np.zeros(len(triangles))
+    a, b, c = (uv[triangles[:, k]] for k in range(3))
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    height, width = texture.levels[0].shape[:2]
+    area: Floats = np.log2(np.maximum(np.abs(ux * vy - uy * vx) * width * height, 1e-12))
+    return area
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """The items as one mesh; `point` (items + 1,) and `vertex` (items + 1,) where each begins; uv (n, 2)."""
+
+    mesh: raster.Mesh
+    point: Ints
+    vertex: Ints
+    uv: Floats
+
+
+def _joined(items: Sequence[DrawItem]) -> _Scene:
+    splits = [_split(item) for item in items]
+    point = np.cumsum([0] + [len(item.points) for item in items]).astype(np.int32)
+    vertex = np.cumsum([0] + [len(origin) for origin, _, _ in splits]).astype(np.int32)
+    start, fan = _fans(np.concatenate([q.triangles + p for q, p in zip(items, point, strict=False)]), int(point[-1]))
+    origin = np.concatenate([s[0] + p for s, p in zip(splits, point, strict=False)])
+    first, count = start[origin], np.diff(start)[origin]
+    end = np.cumsum(count)
+    take = np.repeat(first - (end - count), count) + np.arange(end[-1])
+    number = np.arange(len(items), dtype=np.int32)
+    mesh = raster.Mesh(
+        triangle=np.concatenate([s[1] + v for s, v in zip(splits, vertex, strict=False)]).astype(np.int32),
+        item=np.repeat(number, [len(item.triangles) for item in items]),
+        owner=np.repeat(number, np.diff(vertex)),
+        origin=origin.astype(np.int32),
+        start=np.concatenate([[0], end]).astype(np.int32),
+        fan=fan[take],
+        texels=np.concatenate([_texels(s[1], s[2], q.material.texture) for q, s in zip(items, splits, strict=True)]),
+    )
+    uv = np.concatenate([np.zeros((len(origin), 2)) if uv is None else uv for origin, _, uv in splits])
+    return _Scene(mesh, point, vertex, uv)
 
 
 def _contact_steps() -> Floats:
@@ -112,7 +155,8 @@ class Renderer:
     """Draws the same items, moved, again and again, from one camera.
 
     size : (width, height) [pixel] or one number   items : drawn together, those of a higher `Material.layer` blended
-    over the rest with `layer_opacity`. `draw` returns (height, width, 3) RGB bytes, valid until the next call.
+    over the rest with `layer_opacity`; what the first one hides costs little. `draw` returns (height, width, 3) RGB
+    bytes, valid until the next call.
     """
 
     def __init__(
@@ -134,28 +178,28 @@ class Renderer:
         self.size, self.items, self.look = (width, height), tuple(items), look or Look()
         self.layer_opacity = layer_opacity
         self._layers = sorted({item.material.layer for item in items})
-        self._first = np.cumsum([0] + [len(item.points) for item in items]).astype(np.int32)
-        self._mesh = _joined(self.items, self._first)
+        self._scene = _joined(self.items)
+        self._mesh, self._points = self._scene.mesh, np.concatenate([item.points for item in items])
         slots = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        self._frame = raster.buffers(int(self._first[-1]), len(self._mesh.triangle), width, height, slots)
+        self._frame = raster.buffers(len(self._mesh.origin), len(self._mesh.triangle), width, height, slots)
         self._paint = paint_tables([item.material for item in items], self.look, height)
-        self._points = np.concatenate([item.points for item in items])
         self._steps = _contact_steps()
-        bands = len(self._frame.row_start) - 1
         self._moved = np.ones(len(items), np.bool_)
         self._poses: list[Floats | None] = [None] * len(items)
-        self._number = np.zeros((bands, shade.N_NUMBER, 4 * width), np.float32)
-        casts = np.array([item.material.casts and item.material.layer == 0 for item in items])[self._mesh.item]
-        use = self.look.shadow and bool(casts.any())
-        self._shadow_map = ShadowMap(self._mesh, casts, self._points, self._paint) if use else None
-        self._shadow = no_shadow()
-        self._samples: NDArray[np.int64] | None = None
+        self._number = np.zeros((slots, shade.N_NUMBER, raster.row_length(width)), np.float32)
+        casts = np.array([self.look.shadow and q.material.casts and q.material.layer == 0 for q in items])
+        self._shadow = shadow_tables(self._mesh, casts)
+        self._caster = np.concatenate(
+            [q.points[q.triangles.ravel()] for q, c in zip(items, casts, strict=True) if c] or [np.zeros((0, 3))]
+        )
+        self._samples: NDArray[np.int32] | None = None
         self._out = np.zeros((height, width, 3), np.uint8)
         self.camera = camera
         for i, item in enumerate(self.items):
             self.set_occlusion(i, 1.0 if item.occlusion is None else item.occlusion)
-            if item.vertex_colour is not None:
-                self.set_colour(i, item.vertex_colour)
+            self.set_colour(i, item.material.colour if item.vertex_colour is None else item.vertex_colour)
+            if item.material.texture is not None and not item.material.vertex_colour:
+                self._frame.vertex[self._vertices(i), 4:6] = self._scene.uv[self._vertices(i)]
 
     @property
     def camera(self) -> Camera:
@@ -167,17 +211,27 @@ class Renderer:
         self._camera = camera
         self._numbers = camera.numbers(*self.size)
         self._moved[:] = True
+        if self._shadow.casts.any():
+            self._shadow = aim(self._shadow, self._caster, camera, self._paint.light[0, :3].astype(np.float64))
 
     def _slice(self, item: int) -> slice:
-        return slice(int(self._first[item]), int(self._first[item + 1]))
+        return slice(int(self._scene.point[item]), int(self._scene.point[item + 1]))
+
+    def _vertices(self, item: int) -> slice:
+        return slice(int(self._scene.vertex[item]), int(self._scene.vertex[item + 1]))
+
+    def _spread(self, item: int, values: Any) -> Any:
+        """Values of an item's vertices, from those of its points (n, ...)."""
+        return np.asarray(values)[self._mesh.origin[self._vertices(item)] - self._scene.point[item]]
 
     def set_occlusion(self, item: int, value: Any) -> None:
-        """Set how open to light the vertices of an item are, (n,) or one number in [0, 1]."""
-        self._frame.vertex[self._slice(item), 3] = value
+        """Set how open to light the points of an item are, (n,) or one number in [0, 1]."""
+        self._frame.vertex[self._vertices(item), 3] = value if np.ndim(value) == 0 else self._spread(item, value)
 
     def set_colour(self, item: int, colour: Any) -> None:
-        """Set the colours of an item's vertices, (n, 3) sRGB in [0, 1]; its material must have `vertex_colour`."""
-        self._frame.vertex[self._slice(item), 4:7] = linear(colour)
+        """Set the colours of an item's points, (n, 3) or one, sRGB in [0, 1]; has no effect under a texture."""
+        light = linear(colour)
+        self._frame.vertex[self._vertices(item), 4:7] = light if light.ndim == 1 else self._spread(item, light)
 
     def _place(self, points: Mapping[int, Any] | Sequence[Any] | None, bone_pose: Any) -> None:
         given = points if isinstance(points, Mapping) else dict(enumerate(points or ()))
@@ -198,30 +252,32 @@ class Renderer:
 
     def _cover(self, layer: int, listed: bool = True) -> None:
         """Find what is seen of one layer: the list of fragments, or (not `listed`) all samples."""
+        cast = layer == self._layers[0] and bool((self._moved & self._shadow.casts).any())
         if len(self._layers) > 1:  # what the other layer left in the tables is of no use
             self._moved[:] = True
-        raster.setup_pass(self._moved, self._mesh, self._numbers, float(layer), self._frame, self._paint)
+        tables = (self._numbers, self._mesh, self._frame, self._paint)
+        raster.setup_pass(float(layer), self._moved, *tables, cast, self._shadow)
         self._moved[:] = False
         if raster.band_pass(self._frame) > len(self._frame.row_list):
             self._frame = raster.longer_list(self._frame)
             raster.band_pass(self._frame)
-        order = dealt(np.diff(self._frame.row_start))
-        raster.coverage_pass(order, listed, self._mesh, self._numbers, self._frame)
+        cost = np.diff(self._frame.row_start[::2]) + BAND_COST
+        order = dealt(np.append(cost, np.full(strips(self._shadow) if cast else 0, STRIP_COST)))
+        raster.coverage_pass(order, listed, self._mesh.item, self._frame, self._shadow)
 
     def _prepare(self) -> None:
         """Normals and projection of all vertices."""
         if not isfinite(float(self._points.sum())):
             bad = int(np.argmax(~np.isfinite(self._points).all(axis=1)))
-            item = int(np.searchsorted(self._first, bad, side="right")) - 1
-            raise RunError(f"vertex {bad - self._first[item]} of item {item} has a position that is not finite")
-        raster.facet_pass(self._moved, self._mesh, self._points, self._frame)
-        raster.vertex_pass(self._moved, self._mesh, self._points, self._numbers, self._frame)
+            item = int(np.searchsorted(self._scene.point, bad, side="right")) - 1
+            raise RunError(f"vertex {bad - self._scene.point[item]} of item {item} has a position that is not finite")
+        raster.place_pass(self._moved, self._mesh, self._points, self._numbers, self._frame, self._shadow)
 
     def depth(self) -> Floats:
         """Return the depth [mm] of the four samples of each pixel as last placed, (h, w, 4), inf where nothing is."""
         self._prepare()
         width, height = self.size
-        kept, bands = self._frame.sample, len(self._frame.row_start) - 1
+        kept, bands = self._frame.sample, len(self._frame.row_start) // 2
         if self._samples is None:
             self._samples = raster.sample_buffer(bands, width)
         self._frame = self._frame._replace(sample=self._samples)
@@ -229,7 +285,7 @@ class Renderer:
             self._cover(self._layers[0], listed=False)
         finally:
             self._frame = self._frame._replace(sample=kept)
-        number = (self._samples >> 32).reshape(bands * raster.BAND, -1, 4)[:height, :width]
+        number = self._samples[..., : raster.BLOCK].reshape(bands * raster.BAND, -1, 4)[:height, :width]
         with np.errstate(divide="ignore"):
             return raster.DEEPEST * self.camera.near / number
 
@@ -243,9 +299,6 @@ class Renderer:
         """
         self._place(points, bone_pose)
         self._prepare()
-        if self._shadow_map is not None:
-            direction = self._paint.light[0, :3].astype(np.float64)
-            self._shadow = self._shadow_map.draw(self._points, self._camera, direction)
         for layer in self._layers:
             self._cover(layer)
             opacity = -1.0 if layer == self._layers[0] else self.layer_opacity

@@ -99,7 +99,6 @@ class Material:
     def row(self, textures: list[Texture]) -> Floats:
         """Return the kernel's numbers, adding the texture to `textures` if it is new."""
         out = np.zeros(k.N_MATERIAL)
-        out[:3] = linear(self.colour)
         if self.texture is not None and not self.vertex_colour:
             if not any(t is self.texture for t in textures):
                 textures.append(self.texture)
@@ -220,6 +219,6 @@ def paint_tables(materials: Sequence[Material], look: Look, height: int) -> k.Pa
         texel=texel,
         level=level,
         level_count=count,
-        encode=encode_table(),
+        encode=encode_table().astype(np.int32),
         background=look.background.rows(height),
     )

@@ -31,7 +31,7 @@ def test_wrong_options_are_refused_by_name(wrong: dict[str, object], message: st
         Options(**wrong)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("scheme", ["block_descent", "semi_implicit", "explicit"])
+@pytest.mark.parametrize("scheme", ["conjugate_gradient", "block_descent", "semi_implicit", "explicit"])
 def test_bytes_do_not_depend_on_threads_or_on_the_run(scheme: str) -> None:
     """One thread or two, first run or second: the same bytes."""
     body = held_sheet(10, 10)
@@ -46,7 +46,7 @@ def test_bytes_do_not_depend_on_threads_or_on_the_run(scheme: str) -> None:
     assert results[0] == results[1] == results[2]
 
 
-@pytest.mark.parametrize("scheme", ["block_descent", "newton", "explicit"])
+@pytest.mark.parametrize("scheme", ["conjugate_gradient", "block_descent", "newton", "explicit"])
 def test_motion_settles_at_the_equilibrium(scheme: str) -> None:
     """After a second under a constant control the skin stands where `solve_static` says."""
     body = held_sheet(10, 10)
@@ -72,7 +72,7 @@ def test_skin_is_kept_out_of_bone_and_eyeball() -> None:
     assert (np.linalg.norm(state.q[~body.pinned] - eye.centre, axis=1) - eye.radius).min() > 0.0
 
 
-@pytest.mark.parametrize("scheme", ["block_descent", "newton"])
+@pytest.mark.parametrize("scheme", ["conjugate_gradient", "block_descent", "newton"])
 def test_lips_close_without_crossing(scheme: str) -> None:
     """Two sheets 2 mm apart, pressed together within one step or two, meet and stay on their sides."""
     body = two_lips()
@@ -83,7 +83,7 @@ def test_lips_close_without_crossing(scheme: str) -> None:
         case.activation[:] = min(1.0, (k + 1) / 3)
         solver.step(state, state, case, 1 / 30)
     x = body.surface.points
-    inner = np.abs(x[:, :2]).max(axis=1) < 3.0  # the borders may slip past each other
+    inner = np.abs(x[:, :2]).max(axis=1) < 5.0  # the borders may slip past each other
     beneath = LinearNDInterpolator(state.q[n:, :2], state.q[n:, 2])
     gap = state.q[:n, 2][inner[:n]] - beneath(state.q[:n, :2][inner[:n]])
     assert -0.02 < gap.min() < 0.3

@@ -6,6 +6,7 @@ from functools import cache
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 import pytest
 
@@ -88,6 +89,46 @@ def test_eyes_glint_and_lie_behind_the_lids() -> None:
         light = shown.sum(axis=2)[eye]
         assert light.max() > 3 * 215, "the glint"
         assert np.percentile(light, 5) < 0.45 * np.percentile(light, 90), "iris and pupil"
+
+
+def test_the_head_does_not_depend_on_the_number_of_threads() -> None:
+    """One thread and all threads give the same bytes, shadow included, also while the jaw moves."""
+    pose = np.tile(np.eye(4), (2, 1, 1))
+    pose[1, 1, 3] = -6.0
+    drawn = scene()
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        one = [drawn.draw(rest(), p).copy() for p in (None, pose)]
+    finally:
+        numba.set_num_threads(before)
+    other = scene()
+    for picture, p in zip(one, (None, pose), strict=True):
+        np.testing.assert_array_equal(picture, other.draw(rest(), p))
+
+
+def test_eyes_and_mouth_have_few_triangles() -> None:
+    """Parts that fill few pixels cost little: eyes at most 2,500 triangles each, teeth, gums and tongue 14,000."""
+    count = {part.name: len(part.triangles) for part in ingredients()[0].parts}
+    eyes = [n for name, n in count.items() if name.startswith("eye")]
+    assert max(eyes) <= 2500 and sum(count.values()) - sum(eyes) <= 14_000
+
+
+def test_the_iris_is_round() -> None:
+    """Close up, the lower outline of the iris is a circle to within 2 % of its radius and a pixel."""
+    ball = next(part for part in ingredients()[0].parts if part.name == "eye_left")
+    low, high = ball.points.min(axis=0), ball.points.max(axis=0)
+    camera = Camera.front([low, high])
+    part = Part(ball.name, ball.points, ball.triangles, ball.colour)
+    tiny = low + 1e-3 * np.eye(3)  # a head scene needs some skin
+    drawn = head_scene(tiny, np.array([[0, 1, 2]]), size=512, view=camera, parts=[part], occlusion=1.0, mode="plain")
+    light = drawn.draw(tiny).astype(int).sum(axis=2)
+    middle = camera.project([np.append(0.5 * (low + high)[:2], high[2])], 512, 512)[0, :2]
+    turn, reach = np.radians(np.arange(180, 360, 3)), np.arange(60, 200)
+    x = (middle[0] + np.cos(turn)[:, None] * reach).astype(int)
+    y = (middle[1] - np.sin(turn)[:, None] * reach).astype(int)
+    edge = reach[np.diff(light[y, x], axis=1).argmax(axis=1)]
+    assert np.abs(edge - np.median(edge)).max() <= 0.02 * np.median(edge) + 1.0
 
 
 @pytest.mark.parametrize("view", ["front", "three_quarter", "side"])

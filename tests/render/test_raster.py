@@ -180,6 +180,37 @@ def test_picture_does_not_depend_on_the_number_of_threads() -> None:
     np.testing.assert_array_equal(one, Renderer(SIZE, CAMERA, [DrawItem(points, quads, Material())]).draw())
 
 
+def test_hidden_parts_leave_no_trace() -> None:
+    """A ball inside a ball changes no pixel, whether it is drawn before or after; nor does its own far side."""
+    (points, quads), (inner, faces) = ball((0.0, 0.0, 0.0), 25.0), ball((3.0, 2.0, 0.0), 18.0, 12)
+    shell = DrawItem(points, quads, Material(two_sided=True))
+    core = DrawItem(inner, faces, plain(0.0, 1.0))
+    alone = picture(DrawItem(points, quads, Material(two_sided=False)))
+    for items in ((shell,), (shell, core), (core, shell)):
+        np.testing.assert_array_equal(alone, picture(*items))
+
+
+def test_edges_far_beyond_the_picture_are_exact() -> None:
+    """The edge of a triangle thousands of pictures wide passes each sample on the right side, to 0.02 pixel."""
+    y, x = np.mgrid[:SIZE, :SIZE][..., None] + 0.5 - SIZE / 2
+    height = -(y + np.array([-3, -1, 3, 1]) / 8.0) + 0.1 * (x + np.array([-1, 3, 1, -3]) / 8.0)
+    clear = np.abs(height - 7.3) > 0.02
+    for far in (300.0, 40_000.0, 400_000.0):
+        corner = [[-far, 0.1 * far + 7.3], [0.0, -3.0 * far], [far, -0.1 * far + 7.3]]
+        np.testing.assert_array_equal(covered(triangle(corner))[clear], (height < 7.3)[clear])
+
+
+def test_texture_seams_leave_no_crease() -> None:
+    """A ball whose texture is cut along a meridian is lit as one in one piece: normals are shared across the seam."""
+    points, quads = ball((0.0, 0.0, 0.0), 25.0)
+    texture = Texture.of(np.full((4, 4, 3), 170, np.uint8))
+    skin = Material(texture=texture)
+    uv = np.full((2 * len(points), 2), 0.5)
+    cut = quads + len(points) * (points[quads, 0].mean(axis=1) > 0.0)[:, None]
+    whole = picture(DrawItem(points, quads, skin, uv, quads))
+    np.testing.assert_array_equal(whole, picture(DrawItem(points, quads, skin, uv, cut)))
+
+
 def test_texture_lies_as_its_uv_say() -> None:
     """u runs to the right and v upwards over the picture of the texture, whose first row is on top."""
     image = np.zeros((2, 2, 3), np.uint8)
@@ -281,6 +312,32 @@ def test_key_light_throws_a_soft_shadow() -> None:
     assert part[shade] < 0.75
     np.testing.assert_allclose(part[:24], 1.0, atol=0.02)
     assert (np.abs(np.diff(part[shade - 20 :])) < 0.2).all()
+
+
+def test_shadow_reaches_the_rim_of_what_it_falls_on() -> None:
+    """A shadow is as dark near the outline of a wall, behind which nothing is, as in its middle."""
+    grey = Material(colour=(0.7, 0.7, 0.7), specular=0.0, casts=True)
+    items = [square(28.0, -20.0, grey), square(20.0, 20.0, grey, x=-26.0)]
+    lamp = Lighting(lights=(Light((-0.5, 0.0, 0.8), (0.7, 0.7, 0.7)),))
+    out = {}
+    for shadow in (True, False):
+        out[shadow] = linear(Renderer(SIZE, CAMERA, items, look=Look(lamp, BLACK.background, shadow)).draw() / 255.0)
+    column = slice(32 - 4, 32 + 8)  # shaded, and not hidden by the plate
+    part = out[True][:, column, 0] / np.maximum(out[False][:, column, 0], 1e-3)
+    assert part[32].max() < 0.6
+    assert part[32 + 18].max() < part[32].max() + 0.1
+
+
+def test_shadow_follows_what_throws_it() -> None:
+    """Moving only the plate moves its shadow; a frame in which nothing moves is the same picture."""
+    grey = Material(colour=(0.7, 0.7, 0.7), specular=0.0, casts=True)
+    items = [square(120.0, -40.0, grey), square(8.0, 0.0, grey)]
+    renderer = Renderer(SIZE, CAMERA, items, look=Look(Lighting(), BLACK.background))
+    first = renderer.draw().copy()
+    away = renderer.draw({1: items[1].points + np.array([0.0, -14.0, 0.0])}).copy()
+    np.testing.assert_array_equal(away, renderer.draw())
+    assert (np.abs(away.astype(int) - first).max(axis=2) > 8).sum() > 100
+    np.testing.assert_array_equal(first, renderer.draw({1: items[1].points}))
 
 
 def test_lying_surfaces_throw_no_shadow_on_themselves() -> None:

@@ -74,7 +74,7 @@ def test_rigid_motion_of_bones_and_skin_gives_no_force() -> None:
     np.testing.assert_allclose(solver.solve_static(moved).q, state.q, atol=1e-7)
 
 
-@pytest.mark.parametrize("scheme", ["block_descent", "semi_implicit", "newton"])
+@pytest.mark.parametrize("scheme", ["conjugate_gradient", "block_descent", "semi_implicit", "newton"])
 def test_symmetric_activation_gives_a_symmetric_face(scheme: str) -> None:
     """A sheet that is its own mirror image, pulled alike on both sides, stays so to round-off."""
     body = replace(held_sheet(), spheres=())

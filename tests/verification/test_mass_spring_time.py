@@ -42,6 +42,11 @@ def played(body: Body, h: float, end: float, **options: Any) -> np.ndarray:
         ({"scheme": "newton", "integrator": "euler", "newton_tolerance": 1e-8}, 1 / 400, 1),
         ({"scheme": "newton", "integrator": "bdf2", "newton_tolerance": 1e-8}, 1 / 400, 2),
         ({"scheme": "block_descent", "integrator": "bdf2", "sweeps": 200, "sweep_tolerance": 1e-9}, 1 / 400, 2),
+        (
+            {"scheme": "conjugate_gradient", "integrator": "bdf2", "iterations": 60, "iteration_tolerance": 1e-9},
+            1 / 400,
+            2,
+        ),
         ({"scheme": "explicit"}, 1 / 2000, 2),
     ],
 )
@@ -58,7 +63,11 @@ def test_schemes_agree_on_the_motion() -> None:
     body = soft_sheet()
     reference = played(body, 1 / 2000, 0.1, scheme="explicit")
     moved = np.linalg.norm(reference - body.surface.points)
-    for options in ({"scheme": "newton"}, {"scheme": "block_descent", "sweeps": 30}):
+    for options in (
+        {"scheme": "newton"},
+        {"scheme": "block_descent", "sweeps": 30},
+        {"scheme": "conjugate_gradient", "iteration_tolerance": 1e-5},
+    ):
         assert np.linalg.norm(played(body, 1 / 400, 0.1, **options) - reference) < 0.01 * moved
 
 
@@ -79,7 +88,7 @@ def one_triangle(stiffness: float, **changes: Any) -> Body:
     return Body(**(fields | changes))
 
 
-@pytest.mark.parametrize("scheme", ["explicit", "newton", "block_descent"])
+@pytest.mark.parametrize("scheme", ["explicit", "newton", "block_descent", "conjugate_gradient"])
 def test_a_mass_on_springs_has_the_analytic_period(scheme: str) -> None:
     """Small swings along the height of an isosceles triangle: omega^2 = 2 k cos^2(half angle) / m."""
     body = one_triangle(3.0)

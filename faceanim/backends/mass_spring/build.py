@@ -23,8 +23,8 @@ class Patch:
 
     nodes : (n,) body vertex of each   m : how many are free   held : (n,) those carried by the bones
     mass : (n,) [kg]   edge_of : (3, t) edge opposite each corner   pairs : (e, 2) vertices of each edge, smaller first;
-    the first `n_pair` edges join free vertices   shear : (e, 2) of the layer beneath [mN/mm] and its growth [mN/mm^3]   scene : kernel tables
-    muscles : how many the body has   half : what is mirrored
+    the first `n_pair` edges join free vertices   shear : (e, 2) of the layer beneath [mN/mm] and its growth [mN/mm^3]
+    scene : kernel tables   muscles : how many the body has   half : what is mirrored
     """
 
     nodes: Ints

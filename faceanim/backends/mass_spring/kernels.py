@@ -292,7 +292,7 @@ def conjugate_gradient(x, scene, moment, scratch, weight, centre, half, factor, 
 
     Each iteration evaluates the forces once, a trial step ahead; the curvature met on the way gives the step's length,
     and the residual there follows by the same secant.
-    half : `tables.Half`   factor : `tables.Factor`   most : iterations   tolerance : stop when one moves no vertex farther [mm]
+    half, factor : see `tables`   most : iterations   tolerance : stop when one moves no vertex farther [mm]
     force : (n, 4), work : residual, the one before, trial residual, preconditioned, direction (m, 3) and (m, 4)
     reach : of the contacts with bones and eyeballs, found anew halfway if vertices may have used up half of it by then
     Returns (iterations, largest residual [mN], longest move of the last [mm]).

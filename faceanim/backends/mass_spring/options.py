@@ -20,7 +20,7 @@ class Options:
         "newton" the same steps solved to the end, the yardstick; "explicit" leapfrog with automatic substeps;
         "semi_implicit" and "paper" the per-node implicit steps of Zhang, Prakash & Sung (Eqs. 18-19), corrected and
         as printed: relaxers rather than integrators, see the stability atlas
-    integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), for conjugate_gradient, block_descent and newton
+    integrator : "euler" (quiet in contact, the default) or "bdf2" (second order), of the implicit schemes
     iterations : most conjugate gradient iterations in a step
     iteration_tolerance : they stop when one moves no vertex farther [mm]
     symmetric : conjugate gradients work on one half while body, state and control are left-right symmetric
@@ -44,7 +44,7 @@ class Options:
     symmetric: bool = True
     sweeps: int = 20
     adaptive: bool = False
-    tolerance: float = 0.15
+    tolerance: float = 0.05
     quasi_static: str = "integrated"
     passes: int = 4
     sweep_tolerance: float = 3e-5

@@ -8,6 +8,8 @@ matrix of a face to about 9 where its diagonal gives 470 (`tools/bench_sweeps.py
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -94,7 +96,7 @@ def _minimum_degree(matrix: sparse.csr_matrix) -> Ints:
     return order
 
 
-def _decompose(matrix: sparse.csc_matrix, order: str) -> object:
+def _decompose(matrix: sparse.csc_matrix, order: str) -> Any:
     """Return the LU decomposition of a symmetric positive definite matrix, pivots on the diagonal."""
     return splu(matrix, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 

@@ -161,7 +161,8 @@ class ConjugateGradient(_Implicit):
                 self.stiffness, self.order, self.touching + self.weight[: load.patch.m], self.copies
             )
         iterations, residual, move = kernels.conjugate_gradient(
-            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, load.patch.half, self.factors[gamma],
+            load.x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, load.patch.half,
+            self.factors[gamma],
             options.iterations, options.iteration_tolerance, REACH, load.force, self.work,
         )  # fmt: skip
         report.iterations += iterations

@@ -36,7 +36,7 @@ class Symmetry:
 def find_symmetry(body: Body) -> Symmetry | None:
     """Return the body's symmetry about the plane x = 0, or None if it has none."""
     vertex = topology.mirror_images(body.surface.points)
-    if vertex is None or not _same_surface(body, vertex):
+    if vertex is None or not (_same_surface(body, vertex) and _same_obstacles(body, vertex)):
         return None
     a = body.attachment
     for field in (body.mass, body.pinned, a.stiffness, a.bone_weight):
@@ -57,12 +57,29 @@ def _same_surface(body: Body, vertex: Ints) -> bool:
     return all(f is None or np.allclose(f[mine], f[its], rtol=1e-6) for f in fields)
 
 
+def _same_obstacles(body: Body, vertex: Ints) -> bool:
+    """Return whether bones and eyeballs lie as far from each vertex as from its image, and whether both may touch."""
+    points = body.surface.points
+    for bone in body.bones:
+        if bone.grid is not None:
+            far = bone.grid.sample(points)
+            if np.abs(far - far[vertex]).max(initial=0.0) > 1e3 * CLOSE:
+                return False
+    touching = [p.node for p in body.pairs], [s.node for s in body.spheres]
+    nodes = [np.concatenate(kind) for kind in touching if kind]
+    if body.bone_contact is not None:
+        nodes += [body.bone_contact.node[body.bone_contact.bone == b] for b in range(len(body.bones))]
+    balls = {(*np.round(s.centre, 5), round(s.radius, 5)) for s in body.spheres}
+    images = {(*np.round(s.centre * FLIP, 5), round(s.radius, 5)) for s in body.spheres}
+    return balls == images and all(np.array_equal(np.unique(node), np.unique(vertex[node])) for node in nodes)
+
+
 def _mirror_muscles(body: Body, vertex: Ints) -> Ints | None:
     """Return each muscle's mirror image, (m,), or None if some muscle has none."""
     u = body.muscles
     table = {}
     for k in range(len(u.names)):
-        table[k] = _fibres(body, k, np.arange(len(vertex)), np.ones(3))
+        table[k] = _fibres(body, k, np.arange(len(vertex), dtype=np.int32), np.ones(3))
     out = np.full(len(u.names), -1, dtype=np.int32)
     for k in table:
         image = _fibres(body, k, vertex, FLIP)
