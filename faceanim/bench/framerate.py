@@ -140,11 +140,15 @@ def table_row(session: Session, drawing: list[float], accuracy: Accuracy | None)
 
 @dataclass(frozen=True)
 class Share:
-    """What a step costs when `vertices` of all are dynamic: median milliseconds, and the share of a full step."""
+    """What an iteration costs, overheads of its step included, and the share of one on the full mesh.
+
+    vertices : how many move   worked_on : how many of them are computed, the others being mirror images
+    """
 
     what: str
     vertices: int
-    step_ms: float
+    worked_on: int
+    iteration_ms: float
     share: float
 
 
@@ -153,18 +157,21 @@ PUBLISHED_DYNAMIC = 1048
 
 
 def shares(session: Session, *, rounds: int = 40) -> list[Share]:
-    """Return what a step costs with every vertex dynamic, with the partition of `session`, and with 1,048 vertices.
+    """Return what an iteration costs with every vertex dynamic, with 1,048 vertices, and with the partition of `session`.
 
-    Steps alternate between the solvers in one run, so that all see the same machine. Empty for a full session.
+    The first two without the help of symmetry. Steps alternate between the solvers in one run, so that all see the same
+    machine. Empty for a full session.
     """
-    full = full_session(session)
-    if full is None:
+    whole_face = full_session(session)
+    if whole_face is None:
         return []
     session.warm()
-    sessions = {"every vertex dynamic": full, f"{session.expression.name}, adaptive": session}
+    full = with_options(whole_face, _steady(whole_face.options, symmetric=False), whole_face.dt)
+    sessions = {FULL: full}
     fewer = _with_dynamic(session, PUBLISHED_DYNAMIC)
     if fewer is not None:
         sessions[f"{PUBLISHED_DYNAMIC} dynamic vertices"] = fewer
+    sessions[f"{session.expression.name}, adaptive"] = with_options(session, _steady(session.options), session.dt)
     spent: dict[str, list[float]] = {name: [] for name in sessions}
     states = {}
     for name, one in sessions.items():
@@ -174,11 +181,22 @@ def shares(session: Session, *, rounds: int = 40) -> list[Share]:
         for name, one in sessions.items():
             control = one.control(min(1.0, (k + 1) / rounds))
             start = perf_counter()
-            one.solver.step(states[name], states[name], control, one.dt)
-            spent[name].append(perf_counter() - start)
+            report = one.solver.step(states[name], states[name], control, one.dt)
+            spent[name].append((perf_counter() - start) / max(1, report.iterations))
     times = {name: 1e3 * median(values) for name, values in spent.items()}
-    whole = times["every vertex dynamic"]
-    return [Share(name, sum(counts(one)[:2]), times[name], times[name] / whole) for name, one in sessions.items()]
+    return [
+        Share(name, sum(counts(one)[:2]), getattr(one.solver, "worked_on", 0), times[name], times[name] / times[FULL])
+        for name, one in sessions.items()
+    ]
+
+
+FULL = "every vertex dynamic"
+
+
+def _steady(options: Any, **changes: Any) -> Any:
+    """Return options with which every step makes all its iterations, and with those `changes` that they know."""
+    wanted = {"iteration_tolerance": 1e-12, "sweep_tolerance": 1e-12} | changes
+    return replace(options, **{name: value for name, value in wanted.items() if hasattr(options, name)})
 
 
 def _with_dynamic(session: Session, count: int) -> Session | None:
@@ -195,7 +213,7 @@ def _with_dynamic(session: Session, count: int) -> Session | None:
     nearest = free[np.argsort(np.linalg.norm(points[free] - middle, axis=1), kind="stable")[:count]]
     node_set = np.zeros_like(partition.node_set)
     node_set[nearest] = 2
-    other = with_options(session, session.options, session.dt)
+    other = with_options(session, _steady(session.options, symmetric=False), session.dt)
     other.warm()
     other.solver.use(replace(partition, node_set=node_set, wave=np.zeros_like(partition.wave)))  # type: ignore[attr-defined]
     return other

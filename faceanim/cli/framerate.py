@@ -128,5 +128,8 @@ def _print(rows: list[Row], shares: list[Any], computer: dict[str, Any]) -> None
         console = Console(width=170)
     console.print(table)
     for share in shares:
-        words = f"{share.what}: {share.vertices} vertices, {share.step_ms:.3f} ms a step, {share.share:.3f} of all"
+        words = (
+            f"{share.what}: {share.vertices} vertices ({share.worked_on} computed), "
+            f"{share.iteration_ms:.3f} ms an iteration, {share.share:.3f} of all"
+        )
         console.print(words, highlight=False)

@@ -81,6 +81,15 @@ def extrapolate(x, v, h, least):
 
 
 @kernel
+def fastest(v, nodes):
+    """Return the largest speed of `nodes` among the velocities `v` (n, 3)."""
+    worst = 0.0
+    for i in nodes:
+        worst = max(worst, v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
+    return math.sqrt(worst)
+
+
+@kernel
 def begin(q, qd, q_before, qd_before, nodes, mass, m, drag, gamma, now, before, centre, weight):
     """Write c (n, 3) and w (n,) of an implicit step for the first `m` of `nodes`.
 

@@ -13,6 +13,9 @@ from faceanim.kernels import attachment, contact, muscles
 from faceanim.kernels.springs import elastic_energy, force_scratch
 from faceanim.kernels.tables import Moment
 
+NEAREST = 0.3
+"""Lips and lids nearer than this beyond their gap [mm] are always watched; farther ones if they may meet in a step."""
+
 
 class Load:
     """The work space of one patch and the boundary conditions that a control sets on it.
@@ -66,7 +69,9 @@ class Load:
     def ahead(self, v: Floats, h: float, least: float, reach: float, pair_reach: float) -> None:
         """Move `x` on by h v and find the contacts for the step: those of lips and lids where it starts, still apart."""
         scene, moment, x = self.patch.scene, self.moment, self.x
-        moment.planes.count[1] = contact.find_pairs(x, scene.colliders, pair_reach, 0, moment.planes)
+        way = h * kernels.fastest(v, scene.colliders.pair_node)
+        near = min(pair_reach, NEAREST + 2.0 * way)
+        moment.planes.count[1] = contact.find_pairs(x, scene.colliders, near, 0, moment.planes)
         kernels.extrapolate(x, v, h, least)
         contact.hold_back(x, scene.free, moment.planes)
         kernels.reflect(x, self.patch.half)

@@ -72,7 +72,7 @@ class SolverMassSpring:
     """Masses and nonlinear springs under muscles, bones and contact.
 
     See `Options` for the schemes. `dt_max` [s] is infinite except for "explicit": its largest stable step at rest
-    (larger ones are divided).
+    (larger ones are divided). `worked_on` tells how many vertices the last step computed, mirror images left out.
     """
 
     Options: ClassVar[type] = Options
@@ -83,6 +83,7 @@ class SolverMassSpring:
         self.tables = Tables(body)
         self.dt_max = np.inf
         self.static_report = NewtonReport()
+        self.worked_on = 0
         self.pins = Pins(body)
         self._motion = Motion(len(body.surface.points))
         self._horizon = 1000.0 + 2.0 * float(np.abs(body.surface.points).max(initial=0.0))
@@ -196,6 +197,7 @@ class SolverMassSpring:
         self.pins.move(control, self._motion, dt)
         half = self._halves(state_in, control)
         scheme = self._scheme(half)
+        self.worked_on = scheme.load.patch.m
         scheme.load.apply(control)
         scheme.advance(self._motion, dt, report)
         if half and self._symmetry is not None:
