@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from faceanim.backends.mass_spring import kernels
 from faceanim.backends.mass_spring.load import Load
 from faceanim.ground.arrays import Floats
 from faceanim.kernels import attachment, contact, linalg3, muscles, tangent
@@ -164,10 +165,12 @@ class Newton:
 
     def _gradient(self, x: Floats) -> float:
         """Compute the downhill `gradient` and return its largest nodal value [mN]."""
-        m = self.load.patch.m
-        force = self.load.forces(x)
-        self.gradient[:m] = force[:m, :3] - self.weight[:m, None] * (x[:m] - self.centre[:m])
-        return float(np.sqrt((self.gradient[:m] ** 2).sum(axis=1).max(initial=0.0)))
+        load = self.load
+        attachment.find_shift(x, load.moment.anchor, load.moment.shift)
+        kernels.residual_force(
+            x, load.patch.scene, load.moment, load.scratch, self.weight, self.centre, load.force, self.gradient
+        )
+        return float(kernels.longest(self.gradient))
 
     def _length(self) -> float:
         """Return the norm of `step` in the metric of the preconditioner."""
