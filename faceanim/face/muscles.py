@@ -25,8 +25,9 @@ Side = Literal["any", "upper", "lower"]
 class LinearMuscle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="linear", tag_field="kind"):
     """Fibres converge on one point of bone.
 
-    origin, insertion [mm]; force [mN]; radius [mm] of the bump around the insertion; angle [deg] of the cone from the
-    origin; bone that carries the origin; mouth side that the zone is confined to
+    origin, insertion [mm]; force [mN]; radius [mm] of the bump around the insertion; angle [deg] of the cone from
+    where the pull goes; bone that carries the origin; mouth side that the zone is confined to
+    via [mm] : where the fibres bend over bone or tissue; the pull is towards it (None: towards the origin)
     """
 
     origin: Vec
@@ -34,6 +35,7 @@ class LinearMuscle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag=
     force: float
     radius: float
     angle: float = 35.0
+    via: Vec | None = None
     bone: str = "cranium"
     side: Side = "any"
     paired: bool = True
@@ -44,6 +46,7 @@ class SheetMuscle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
     length [mm] of the bump along the strip at the insertion; with `galea` > 0 the origin is no bone but the scalp's
     tendon, which is drawn towards the insertion by that share of the force
+    via [mm] : where the fibres bend over bone or tissue; the pull is towards it (None: towards the origin)
     """
 
     origin: Vec
@@ -52,6 +55,7 @@ class SheetMuscle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     half_width: float
     length: float
     galea: float = 0.0
+    via: Vec | None = None
     bone: str = "cranium"
     side: Side = "any"
     paired: bool = True
@@ -142,7 +146,7 @@ def parse_muscles(text: str, source: str) -> dict[str, AnyMuscle]:
 
 def mirrored(muscle: AnyMuscle) -> AnyMuscle:
     """Return the right-side twin of a left-side muscle (x -> -x)."""
-    flipped = {f: (-v[0], *v[1:]) for f in ("origin", "insertion", "centre") if (v := getattr(muscle, f, None))}
+    flipped = {f: (-v[0], *v[1:]) for f in ("origin", "via", "insertion", "centre") if (v := getattr(muscle, f, None))}
     return msgspec.structs.replace(muscle, **flipped)
 
 
@@ -180,31 +184,38 @@ def _zone(
     return _Zone(node, weight, kind, np.ascontiguousarray(points), softening, bone)
 
 
+def _direction(start: Floats, end: Floats) -> Floats:
+    """Return the unit vector (3,) from `start` to `end`."""
+    way = end - start
+    return np.asarray(way / np.linalg.norm(way))
+
+
 def _linear(name: str, m: LinearMuscle, t: Terrain) -> list[_Zone]:
-    origin, insertion = np.array(m.origin), np.array(m.insertion)
-    axis = (insertion - origin) / np.linalg.norm(insertion - origin)
-    ray = t.points - origin
+    pull, insertion = np.array(m.via or m.origin), np.array(m.insertion)
+    axis = _direction(pull, insertion)
+    ray = t.points - pull
     angle = np.arccos(np.clip(ray @ axis / np.linalg.norm(ray, axis=1), -1.0, 1.0))
     radial = np.linalg.norm(t.points - insertion, axis=1) / m.radius
     raw = _on_side(t, m.side) * _bump(radial) * _bump(angle / np.deg2rad(m.angle))
-    return [_zone(name, raw, origin, softening=1.0, bone=t.bones.index(m.bone))]
+    return [_zone(name, raw, pull, softening=1.0, bone=t.bones.index(m.bone))]
 
 
 def _sheet(name: str, m: SheetMuscle, t: Terrain) -> list[_Zone]:
-    origin, insertion = np.array(m.origin), np.array(m.insertion)
-    along = (origin - insertion) / np.linalg.norm(origin - insertion)
+    origin, pull, insertion = np.array(m.origin), np.array(m.via or m.origin), np.array(m.insertion)
     area = _on_side(t, m.side)
 
-    def strip(foot: Floats) -> Floats:
+    def strip(foot: Floats, along: Floats) -> Floats:
         offset = t.points - foot
         run = offset @ along
         across = np.linalg.norm(offset - np.outer(run, along), axis=1)
         return area * _bump(across / m.half_width) * _bump(run / m.length)
 
     bone = t.bones.index(m.bone)
-    zones = [_zone(name, strip(insertion), along, kind=PULL_ALONG, softening=0.0, bone=bone)]
+    along = _direction(insertion, pull)
+    zones = [_zone(name, strip(insertion, along), along, kind=PULL_ALONG, softening=0.0, bone=bone)]
     if m.galea > 0:
-        tail = _zone(name, strip(origin), -along, kind=PULL_ALONG, softening=0.0, bone=bone)
+        down = _direction(origin, insertion if m.via is None else pull)
+        tail = _zone(name, strip(origin, down), down, kind=PULL_ALONG, softening=0.0, bone=bone)
         zones.append(_Zone(tail.node, tail.weight * m.galea, tail.kind, tail.point, 0.0, bone))
     return zones
 
@@ -223,6 +234,10 @@ def _sphincter(name: str, m: SphincterMuscle, t: Terrain) -> list[_Zone]:
 
 _CANTHUS = 5.0
 """Where the lids are nearer to each other than this at rest [mm] they hang together, and the ring pulls less."""
+
+
+_LIFT = 0.4
+"""Share of its depth below the eyeball's arc by which a lid's chord is raised [-]: it must not press into the eye."""
 
 
 def _margin_height(t: Terrain, margin: Ints) -> Floats:
@@ -246,6 +261,7 @@ def _lid(name: str, m: LidMuscle, t: Terrain, side: str) -> list[_Zone]:
     goal = t.points.copy()
     goal[:, 1] = line + np.where(above, 0.35, -0.35) * np.maximum(away, 0.0)
     radius = np.linalg.norm(t.points - eye.centre, axis=1)
+    radius += _LIFT * (goal[:, 1] - t.points[:, 1]) ** 2 / (2.0 * radius)
     across = np.hypot(goal[:, 0] - eye.centre[0], goal[:, 1] - eye.centre[1])
     goal[:, 2] = eye.centre[2] + np.sqrt(np.maximum(radius**2 - across**2, 1.0))
     return [_zone(name, raw, goal, softening=m.softening)]

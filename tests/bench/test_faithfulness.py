@@ -27,14 +27,14 @@ def test_a_field_matches_itself() -> None:
 
 @pytest.mark.slow
 def test_action_units_move_as_the_artist_shapes_do(poser: Poser) -> None:
-    """Mean cosine at least 0.80 over the moving region, peak within 30 % (to two digits)."""
+    """Mean cosine at least 0.80 over the moving region, peak within 30 %."""
     for match in artist_matches(poser):
         assert match.mean_cosine >= 0.80, match
-        assert 0.70 <= round(match.peak_ratio, 2) <= 1.30, match
+        assert 0.70 <= match.peak_ratio <= 1.30, match
 
 
 @pytest.mark.slow
 def test_movements_lie_in_the_published_ranges(poser: Poser) -> None:
-    """Smile, brow, nose, lids, jaw, pucker and funnel reach what people reach (to a tenth)."""
+    """Smile, brow, nose, lids, jaw, pucker and funnel reach what people reach."""
     for movement in movements(poser):
-        assert movement.low <= round(movement.value, 1) <= movement.high, movement
+        assert movement.inside, movement

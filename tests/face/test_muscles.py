@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
 from faceanim.body.body import PULL_ALONG
-from faceanim.face.muscles import LinearMuscle, SheetMuscle, SphincterMuscle, Terrain, build_muscles, parse_muscles
+from faceanim.face.muscles import (
+    LinearMuscle,
+    SheetMuscle,
+    SphincterMuscle,
+    Terrain,
+    build_muscles,
+    mirrored,
+    parse_muscles,
+)
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.errors import AssetError
 
@@ -70,6 +79,18 @@ def test_side_confines_a_zone_to_one_lip():
     muscle = LinearMuscle((10.0, 40.0, -5.0), (10.0, 2.0, 0.0), 100.0, 20.0, side="upper")
     fibres = build_muscles({"m": muscle}, terrain(3.0))
     assert (terrain(3.0).points[fibres.node, 1] >= 0).all()
+
+
+@pytest.mark.parametrize("muscle", [LINEAR, SHEET])
+def test_fibres_pull_towards_where_they_bend(muscle):
+    """With a via the pull goes there and not to the origin; the twin's via is mirrored."""
+    bent = msgspec.structs.replace(muscle, via=(50.0, 5.0, -4.0), paired=False)
+    if isinstance(bent, SheetMuscle):
+        bent = msgspec.structs.replace(bent, galea=0.0)
+    x, y, _ = total_force({"m": bent}, 3.0)
+    assert x > 0.8 * muscle.force
+    assert abs(y) < 0.2 * muscle.force
+    assert mirrored(bent).via == (-50.0, 5.0, -4.0)
 
 
 def test_a_muscle_that_misses_the_skin_is_named():
