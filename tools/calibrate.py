@@ -153,13 +153,13 @@ class Bench:
         n = mesh.vertex_normals[i]
         return np.asarray(point - n * (n @ (point - mesh.points[i])))
 
-    def in_tissue(self, point: Floats) -> bool:
-        """Return whether `point` lies outside both bones and not outside the skin."""
+    def outside_tissue(self, point: Floats) -> float:
+        """Return how far `point` lies inside a bone or above the skin [mm], 0 if it lies in the soft tissue."""
         skull = self.face.skull
         clear = min(float(g.sample(point[None])[0]) for g in (skull.cranium_grid, skull.jaw_grid))
         skin = self.on_skin(point)
         i = np.argmin(np.linalg.norm(self.face.mesh.points - skin, axis=1))
-        return clear > 0.0 and float((point - skin) @ self.face.mesh.vertex_normals[i]) < 0.0
+        return max(0.0, -clear, float((point - skin) @ self.face.mesh.vertex_normals[i]))
 
 
 Change = Callable[[Muscles, Gains, float], None]
@@ -219,7 +219,7 @@ def fit(goal: Goal, table: Muscles, gains: Gains, bench: Bench, most: int, tick:
         total = 0.02 * float((p**2).mean())
         for name in goal.muscles:
             m: Any = t[name]
-            total += 0.0 if m.via is None or bench.in_tissue(np.array(m.via)) else 1.0
+            total += 0.0 if m.via is None else bench.outside_tissue(np.array(m.via))
             low, high = PLAUSIBLE[name]
             total += 0.05 * float(np.log(m.force / np.clip(m.force, low, high)) ** 2)
         try:

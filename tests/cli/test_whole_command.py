@@ -41,11 +41,10 @@ def test_the_pictures_show_a_face_that_changes(smile: Path) -> None:
 
 
 def test_the_record_shows_an_accurate_run(smile: Path) -> None:
-    """The partition stays within 0.3 mm of the full run, the held apex near its equilibrium."""
+    """The partition stays within 0.3 mm of the full run, the held apex within 0.1 mm of its equilibrium."""
     record = json.loads((smile / "run.json").read_text())
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
-    assert record["accuracy_mm"]["rest"]["rms"] < 0.1
-    assert record["accuracy_mm"]["rest"]["max"] < 0.5
+    assert record["accuracy_mm"]["rest"]["max"] < 0.1
     moved = record["apex"]["movements"]
     for side in ("left", "right"):
         assert all(moved[f"mouth_corner_{side}_{way}_mm"] > 0.5 for way in ("out", "up", "back"))
@@ -61,12 +60,18 @@ def test_the_skin_stays_out_of_bone_and_eyeballs(smile: Path) -> None:
     assert max(skin["depth_in_bone"], skin["depth_in_eyeball"]) < 0.1
 
 
-@pytest.mark.xfail(reason="a few triangles of the inner mouth corner fold flat in a full smile, and the lips graze")
 def test_no_triangle_folds_and_no_lip_crosses(smile: Path) -> None:
-    """The skin never folds onto itself and the lips never pass through each other, in any frame."""
+    """The skin never folds onto itself and the lips never pass through each other by 0.1 mm, in any frame."""
     skin = json.loads((smile / "run.json").read_text())["skin_worst_frame_mm"]
     assert skin["inverted_triangles"] == 0
     assert max(skin["depth_crossed"].values()) < 0.1
+
+
+def test_a_symmetric_expression_is_symmetric(smile: Path) -> None:
+    """Left and right are mirror images within 1e-6 mm in every frame."""
+    face = load_face(density="coarse")
+    points = np.load(smile / "points.npy")
+    assert np.abs(points - points[:, face.mirror] * [-1.0, 1.0, 1.0]).max() < 1e-6
 
 
 def test_threads_do_not_change_a_bit(smile: Path, tmp_path: Path) -> None:
@@ -103,9 +108,13 @@ def test_every_expression_is_sound_in_every_frame(name: str, tmp_path: Path) -> 
     words = ["--size", "64", "--quiet", "--no-video", "--out", str(tmp_path)]
     assert main(["express", name, *words]) == 0
     record = json.loads((tmp_path / "run.json").read_text())
+    skin = record["skin_worst_frame_mm"]
+    assert skin["inverted_triangles"] == 0
+    assert max(skin["depth_in_bone"], skin["depth_in_eyeball"], *skin["depth_crossed"].values()) < 0.1
     assert record["accuracy_mm"]["partition"]["max"] < 0.3
-    assert record["accuracy_mm"]["rest"]["rms"] < 0.1
-    assert record["accuracy_mm"]["rest"]["max"] < 0.5
+    assert record["accuracy_mm"]["rest"]["max"] < 0.1
+
+
 
 
 @pytest.mark.slow

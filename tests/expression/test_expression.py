@@ -118,12 +118,12 @@ def test_the_library_holds_the_basic_expressions_with_their_units() -> None:
     """The lists are those of EMFACS, and each file says where its list comes from."""
     lists = {
         "happiness": "6+12",
-        "sadness": "1+4+15",
+        "sadness": "1+4=0.4+15",
         "surprise": "1+2+5=0.4+26",
-        "fear": "1+2+4+5+7+20+26",
+        "fear": "1+2+4=0.4+5+7=0.4+20+26",
         "anger": "4+5+7+23",
         "disgust": "9+15+16",
-        "contempt": "R12=0.2+R14=0.2",
+        "contempt": "R12=0.4+R14=0.8",
         "neutral": "",
         "blink": "45",
     }

@@ -22,6 +22,10 @@ from faceanim.kernels.triangular import solve_factored
 
 FIRST_STEP = 0.5
 """Trial length of the first conjugate gradient step, in preconditioned directions: about one over the stiffest."""
+LARGEST_STEP = 1.5
+"""No step is larger, in preconditioned directions: where contact is lost the skin only seems that soft."""
+FAITHFUL = 0.4
+"""Share of the trial step below which its secant is not trusted with the residual."""
 LONGEST_STEP = 5.0
 """No conjugate gradient step moves a vertex farther [mm]."""
 
@@ -332,14 +336,18 @@ def conjugate_gradient(x, scene, moment, scratch, weight, centre, half, factor, 
         go(x, moment.shift, guess, direction, half)
         residual_force(x, scene, moment, scratch, weight, centre, force, trial)
         bend = slope - dot(trial, direction, half.copies)
-        step = guess * min(4.0, slope / bend) if bend > 0.25 * slope else 4.0 * guess
-        step = min(step, LONGEST_STEP / far)
+        step = guess * min(2.0, slope / bend) if bend > 0.5 * slope else 2.0 * guess
+        step = min(step, LARGEST_STEP, LONGEST_STEP / far)
         go(x, moment.shift, step - guess, direction, half)
         share = step / guess
         for i in range(scene.free):
             for d in range(3):
                 before[i, d] = residual[i, d]
                 residual[i, d] += share * (trial[i, d] - residual[i, d])
+        if share < FAITHFUL:
+            # The trial went into something far stiffer: what was met there says little about the place reached.
+            residual_force(x, scene, moment, scratch, weight, centre, force, residual)
+            rz_before = 0.0
         move = step * far
         travel += move
         if move < tolerance:

@@ -39,7 +39,7 @@ class Options:
 
     scheme: str = "conjugate_gradient"
     integrator: str = "euler"
-    iterations: int = 10
+    iterations: int = 12
     iteration_tolerance: float = 3e-3
     symmetric: bool = True
     sweeps: int = 20
