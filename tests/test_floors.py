@@ -27,6 +27,7 @@ FLOORS = {
     "surgery": 6,
     "cli": 7,
     "studio": 7,
+    "__main__": 8,
 }
 NEIGHBOURS = {("expression", "face")}
 """Rooms of one floor that may be seen from another: face, then expression."""

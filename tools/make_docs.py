@@ -16,10 +16,10 @@ import numpy as np
 from faceanim import Session, load_expression, load_face
 from faceanim.backends import backend_class
 from faceanim.bench.accuracy import apex_frame
-from faceanim.bench.faithfulness import ARTIST_UNITS, artist_fields, match_field
-from faceanim.bench.metrics import movements
+from faceanim.bench.faithfulness import Poser, artist_matches, movements
 from faceanim.cli.drawing import Drawing, Picture
 from faceanim.cli.main import main as faceanim
+from faceanim.face.face import Face
 from faceanim.render.sequence import contact_sheet, write_png
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,20 +29,6 @@ UNITS = tuple("1 2 4 5 6 7 9 10 12 14 15 16 17 18 20 22 24 27 45 L46".split())
 SIZE = 420
 CROP = slice(58, 408), slice(70, 350)
 """The face in a picture of SIZE pixels: rows and columns."""
-
-WANTED = (
-    ("12", "mouth_corner_left_mm", "mouth corner, smile (AU 12) [mm]", "11 to 16"),
-    ("12", "mouth_width_change_percent", "mouth width, smile (AU 12) [%]", "+20 to +35"),
-    ("1+2", "brow_largest_mm", "brow raise (AU 1+2), largest [mm]", "5 to 10"),
-    ("4", "brow_largest_mm", "brow lower (AU 4), largest [mm]", "5 to 8"),
-    ("15", "mouth_corner_left_mm", "mouth corner, frown (AU 15) [mm]", "4 to 7"),
-    ("9", "largest_movement_mm", "nose wrinkle (AU 9), largest [mm]", "6 to 10"),
-    ("45", "lid_aperture_left_mm", "lid aperture, blink (AU 45) [mm]", "below 1.5"),
-    ("27", "incisor_opening_mm", "between the incisors, jaw (AU 27) [mm]", "40 to 47"),
-    ("18", "mouth_width_change_percent", "mouth width, pucker (AU 18) [%]", "-25 to -45"),
-    ("22", "mouth_width_change_percent", "mouth width, funnel (AU 22) [%]", "-25 to -45"),
-)
-"""Formula, measured movement, words, wanted range."""
 
 
 class Apex:
@@ -99,28 +85,21 @@ def pictures(apex: Apex) -> None:
     write_png(DOCS / "inside.png", labelled(shown, list(kinds), 4))
 
 
-def faithfulness(apex: Apex) -> str:
+def faithfulness(face: Face) -> str:
     """Return two Markdown tables: movements beside published ranges, and fields beside the artist's."""
-    lines = ["| movement at full activation | measured | wanted |", "|---|---|---|"]
-    brows = np.array([apex.face.landmarks[f"mid_supraorbital_{side}"] for side in ("left", "right")])
-    near = np.linalg.norm(apex.face.mesh.points[:, None] - apex.face.mesh.points[brows], axis=2).min(axis=1) < 30.0
-    for formula, key, words, wanted in WANTED:
-        session, points = apex.of(formula)
-        found = movements(apex.face, points, session.control(1.0))
-        found["brow_largest_mm"] = float(np.linalg.norm(points - apex.face.mesh.points, axis=1)[near].max())
-        lines.append(f"| {words} | {found[key]:.1f} | {wanted} |")
+    poser = Poser(face)
+    lines = ["| AU | movement at full activation | measured | wanted |", "|---|---|---|---|"]
+    for m in movements(poser):
+        wanted = f"{m.low:g} to {m.high:g}" if m.low > -1.0 or m.high < 0.0 else f"below {m.high:g}"
+        lines.append(f"| {m.action_unit} | {m.what} [{m.unit}] | {m.value:.2f} | {wanted} |")
     lines += [
         "",
         "| AU | artist's unit | mean cosine | peak [mm] | artist's peak [mm] | ratio |",
         "|---|---|---|---|---|---|",
     ]
-    fields = artist_fields(apex.face.density)
-    for unit, name in ARTIST_UNITS.items():
-        _, points = apex.of(unit)
-        m = match_field(apex.face, unit, name, points - apex.face.mesh.points, fields[name])
-        lines.append(
-            f"| {unit} | {name} | {m.mean_cosine:.2f} | {m.peak:.1f} | {m.artist_peak:.1f} | {m.peak_ratio:.2f} |"
-        )
+    for f in artist_matches(poser):
+        numbers = f"{f.mean_cosine:.2f} | {f.peak:.1f} | {f.artist_peak:.1f} | {f.peak_ratio:.2f}"
+        lines.append(f"| {f.action_unit} | {f.artist_unit} | {numbers} |")
     return "\n".join(lines) + "\n"
 
 
@@ -148,7 +127,7 @@ def main() -> None:
     if only in (None, "pictures"):
         pictures(apex)
     if only in (None, "faithfulness"):
-        (DOCS / "faithfulness.md").write_text(faithfulness(apex), encoding="utf-8")
+        (DOCS / "faithfulness.md").write_text(faithfulness(apex.face), encoding="utf-8")
     if only in (None, "framerate"):
         faceanim(["framerate", "--out", str(DOCS)])
     insert_tables()

@@ -9,6 +9,7 @@
 Bands of rows are independent and visit their triangles in a fixed order: the picture does not depend on the number of
 threads. Camera space has x to the right, y up and z away from the eye; a pixel's ray is (rx, ry, 1), and the sums
 w_i = E_i . ray of a triangle are its barycentric coordinates divided by depth, even if it crosses the near plane.
+What is called for every triangle or pixel is inlined by force: handing over descriptors of arrays costs more than it does.
 """
 
 from __future__ import annotations
@@ -43,56 +44,87 @@ _DOWN = np.array([s for i in range(4) for s in (-3, -1, 3, 1)], dtype=np.int64)
 
 
 class Mesh(NamedTuple):
-    """What does not change between frames; vertices and triangles of all items, one after the other.
+    """The triangles of all items, one after the other.
 
-    A point where texture pieces meet counts as one vertex for each of its places in the texture.
-    triangle : (t, 3) vertices   item : (t,)   owner : (n,) item of each vertex   origin : (n,) its point
-    start : (n + 1,), fan : (k, 2) points of the opposite edges of the triangles around each vertex
-    texels : (t,) log2 of the texture's area in the triangle [texel]
+    triangle : (t, 3) vertices   item : (t,)   texels : (t,) log2 of the texture's area in the triangle [texel]
     """
 
     triangle: np.ndarray
     item: np.ndarray
-    owner: np.ndarray
-    origin: np.ndarray
-    start: np.ndarray
-    fan: np.ndarray
     texels: np.ndarray
 
 
-class Frame(NamedTuple):
-    """Buffers of one picture.
+class Fans(NamedTuple):
+    """What surrounds the vertices of all items; a point is one vertex for each of its places in the texture.
+
+    owner : (n,) item of each vertex   origin : (n,) its point
+    start : (n + 1,), edge : (k, 2) points of the opposite edges of the triangles around each vertex
+    """
+
+    owner: np.ndarray
+    origin: np.ndarray
+    start: np.ndarray
+    edge: np.ndarray
+
+
+class Placed(NamedTuple):
+    """Vertices as the camera sees them.
 
     eye : (n, 3) camera space [mm]   screen : (n, 2) [1/256 pixel]
     vertex : (n, 8) normal, occlusion, linear colour or place in the texture, depth
-    plane : (t, 16) rows E_i and the P_ columns
-    deep : (t, 4) fine depth number: gradient in x and y, value at pixel (0, 0)
-    corner : (t, 8) x and y on the screen, four corners if the near plane cuts it, else the last one twice [1/256 pixel]
-    box : (t, 8) first and last pixel in x and y, least and largest depth number
-    rank : (t,) 0 not seen, else 1 drawn first or 2 drawn then, the first and last band from bits 2 and 17 on
-    sample : (slots, BAND, ceil(w / 4), 2 BLOCK) depth numbers (0 = none) and triangles of the samples of a block
-    least : (slots, BAND, ceil(w / 4)) smallest depth number of a block   lane : (slots, 4, BLOCK) work space
-    nearest : (h, w) depth number of the nearest sample, 0 = none
-    row_start : (2 bands + 1,)   row_list : triangles by band and rank
-    fragment : (h, N_WHOLE, row_length) pixel, triangle and number of samples of each surface seen in each row, from left to
-    right; `found` (h,) of them
-    A depth number is DEEPEST * near / depth, a whole number up to DEEPEST.
     """
 
     eye: np.ndarray
     screen: np.ndarray
     vertex: np.ndarray
+
+
+class Faces(NamedTuple):
+    """Triangles as the camera sees them.
+
+    plane : (t, 16) rows E_i and the P_ columns
+    deep : (t, 4) fine depth number: gradient in x and y, value at pixel (0, 0)
+    corner : (t, 8) x and y on the screen, four corners if the near plane cuts it, else the last one twice [1/256 pixel]
+    box : (t, 8) first and last pixel in x and y, least and largest depth number
+    rank : (t,) 0 not seen, else 1 drawn first or 2 drawn then, with the first and last band from bits 2 and 17 on
+    A depth number is DEEPEST * near / depth, a whole number up to DEEPEST.
+    """
+
     plane: np.ndarray
     deep: np.ndarray
     corner: np.ndarray
     box: np.ndarray
     rank: np.ndarray
+
+
+class Bands(NamedTuple):
+    """Triangles by band of rows and rank: `member` (k,), those of bin 2 band + rank - 1 from `start` (bins + 1,) on."""
+
+    start: np.ndarray
+    member: np.ndarray
+
+
+class Samples(NamedTuple):
+    """Work space in which a band is covered.
+
+    sample : (slots, BAND, ceil(w / 4), 2 BLOCK) depth numbers (0 = none) and triangles of the samples of a block
+    least : (slots, BAND, ceil(w / 4)) smallest depth number of a block   lane : (slots, 4, BLOCK)
+    """
+
     sample: np.ndarray
     least: np.ndarray
     lane: np.ndarray
+
+
+class Seen(NamedTuple):
+    """What is seen in the picture.
+
+    nearest : (h, w) depth number of the nearest sample, 0 = none
+    fragment : (h, N_WHOLE, row_length) pixel, triangle and number of samples of each surface seen in each row, from
+    left to right; `found` (h,) of them
+    """
+
     nearest: np.ndarray
-    row_start: np.ndarray
-    row_list: np.ndarray
     fragment: np.ndarray
     found: np.ndarray
 
@@ -105,42 +137,49 @@ def _aligned(shape: tuple[int, ...], kind: type) -> np.ndarray:
     return raw[skip : skip + count].reshape(shape)
 
 
-def sample_buffer(slots: int, width: int) -> np.ndarray:
-    """Return room for the samples of so many bands of a picture of that width [pixel]."""
-    return _aligned((slots, BAND, (width + 3) // 4, 2 * BLOCK), np.int32)
-
-
 def row_length(width: int) -> int:
     """Return room for the fragments of a row of pixels: an odd number of cache lines, that tables spread in the cache."""
     return 16 * (width // 4 + 1 | 1)
 
 
-def buffers(n: int, t: int, width: int, height: int, slots: int) -> Frame:
-    """Return the buffers for n vertices, t triangles and a picture of that size [pixel], drawn by `slots` threads."""
-    bands = -(-height // BAND)
-    return Frame(
-        eye=np.zeros((n, 3)),
-        screen=np.zeros((n, 2), np.int32),
-        vertex=_aligned((n, 8), np.float32),
+def placed_buffers(n: int) -> Placed:
+    """Return room for n vertices."""
+    return Placed(np.zeros((n, 3)), np.zeros((n, 2), np.int32), _aligned((n, 8), np.float32))
+
+
+def face_buffers(t: int) -> Faces:
+    """Return room for t triangles."""
+    return Faces(
         plane=_aligned((t, 16), np.float32),
         deep=_aligned((t, 4), np.float64),
         corner=_aligned((t, 8), np.int32),
         box=_aligned((t, 8), np.int32),
         rank=np.zeros(t, np.int32),
-        sample=sample_buffer(slots, width),
-        least=np.zeros((slots, BAND, (width + 3) // 4), np.int32),
-        lane=_aligned((slots, 4, BLOCK), np.int32),
-        nearest=np.zeros((height, width), np.int32),
-        row_start=np.zeros(2 * bands + 1, np.int32),
-        row_list=np.zeros(4 * t + 64, np.int32),
-        fragment=np.zeros((height, N_WHOLE, row_length(width)), np.int32),
-        found=np.zeros(height, np.int32),
     )
 
 
-def longer_list(frame: Frame) -> Frame:
-    """Return `frame` with the triangle list that its last `band_pass` asked for, and room to spare."""
-    return frame._replace(row_list=np.zeros(int(1.5 * frame.row_start[-1]), np.int32))
+def band_buffers(height: int, room: int) -> Bands:
+    """Return lists of triangles for a picture of that height [pixel]; `band_pass` says how much room they need."""
+    return Bands(np.zeros(2 * -(-height // BAND) + 1, np.int32), np.zeros(room, np.int32))
+
+
+def sample_buffers(slots: int, width: int, lanes: int = 0) -> Samples:
+    """Return room for so many bands of a picture of that width [pixel], covered by as many threads, or by `lanes`."""
+    threads, blocks = lanes or slots, (width + 3) // 4
+    return Samples(
+        sample=_aligned((slots, BAND, blocks, 2 * BLOCK), np.int32),
+        least=np.zeros((threads, BAND, blocks), np.int32),
+        lane=_aligned((threads, 4, BLOCK), np.int32),
+    )
+
+
+def seen_buffers(width: int, height: int) -> Seen:
+    """Return room for what is seen in a picture of that size [pixel]."""
+    return Seen(
+        nearest=np.zeros((height, width), np.int32),
+        fragment=np.zeros((height, N_WHOLE, row_length(width)), np.int32),
+        found=np.zeros(height, np.int32),
+    )
 
 
 class Paint(NamedTuple):
@@ -221,13 +260,13 @@ def project(camera, x, y, z):
 
 
 @kernel(inline=True)
-def _normal(i, origin, start, fan, points):
+def _normal(i, origin, start, edge, points):
     """Sum of the normals of the triangles around vertex i, scaled by twice their area [mm^2]."""
     p = origin[i]
     x, y, z = points[p, 0], points[p, 1], points[p, 2]
     nx, ny, nz = 0.0, 0.0, 0.0
     for k in range(start[i], start[i + 1]):
-        b, c = fan[k, 0], fan[k, 1]
+        b, c = edge[k, 0], edge[k, 1]
         ux, uy, uz = points[b, 0] - x, points[b, 1] - y, points[b, 2] - z
         vx, vy, vz = points[c, 0] - x, points[c, 1] - y, points[c, 2] - z
         nx += uy * vz - uz * vy
@@ -237,18 +276,18 @@ def _normal(i, origin, start, fan, points):
 
 
 @kernel
-def place_pass(moved, mesh, points, camera, frame, shadow):
+def place_pass(moved, fans, points, camera, placed, caster):
     """Normals and places in camera space, on the screen and in the shadow map of moved items' vertices.
 
     points : (p, 3) [mm], finite
     """
-    start, fan, owner, origin = mesh.start, mesh.fan, mesh.owner, mesh.origin
-    eye, screen, vertex = frame.eye, frame.screen, frame.vertex
-    casts, to_map, spot = shadow.casts, shadow.to_map, shadow.spot
+    start, edge, owner, origin = fans.start, fans.edge, fans.owner, fans.origin
+    eye, screen, vertex = placed.eye, placed.screen, placed.vertex
+    casts, to_map, spot = caster.casts, caster.to_map, caster.spot
     for i in range(owner.shape[0]):
         if not moved[owner[i]]:
             continue
-        nx, ny, nz = _normal(i, origin, start, fan, points)
+        nx, ny, nz = _normal(i, origin, start, edge, points)
         scale = 1.0 / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-30))
         p = origin[i]
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
@@ -365,11 +404,11 @@ def _box(x0, y0, x1, y1, x2, y2, x3, y3, width, height):
 
 
 @kernel
-def _set_up_piece(piece, layer, moved, camera, mesh, frame, paint):
+def _set_up_piece(piece, layer, moved, camera, mesh, placed, faces, material):
     """`setup_pass` for every PIECES-th chunk of triangles."""
-    triangle, item, texels, material = mesh.triangle, mesh.item, mesh.texels, paint.material
-    eye, screen, plane, deep = frame.eye, frame.screen, frame.plane, frame.deep
-    corner, box, rank = frame.corner, frame.box, frame.rank
+    triangle, item, texels = mesh.triangle, mesh.item, mesh.texels
+    eye, screen, plane, deep = placed.eye, placed.screen, faces.plane, faces.deep
+    corner, box, rank = faces.corner, faces.box, faces.rank
     width, height = int(2.0 * camera[C_X]), int(2.0 * camera[C_Y])
     for first in range(piece * CHUNK, triangle.shape[0], PIECES * CHUNK):
         for t in range(first, min(first + CHUNK, triangle.shape[0])):
@@ -400,23 +439,24 @@ def _set_up_piece(piece, layer, moved, camera, mesh, frame, paint):
 
 
 @kernel(parallel=True)
-def setup_pass(layer, moved, camera, mesh, frame, paint, cast, shadow):
+def setup_pass(layer, moved, camera, mesh, placed, faces, material, cast, caster):
     """Cull the triangles of moved items in one layer; fill planes, mip levels and boxes of those that may be seen.
 
     cast : whether to draw the depth seen from the key light as well
     """
     for piece in prange(PIECES):
-        _set_up_piece(piece, layer, moved, camera, mesh, frame, paint)
+        _set_up_piece(np.int64(piece), layer, moved, camera, mesh, placed, faces, material)
         if cast:
-            cast_piece(piece, shadow)
+            cast_piece(np.int64(piece), caster)
 
 
 @kernel
-def band_pass(frame):
-    """Sort visible triangles by band of rows, rank and index; return the length the list needs."""
-    rank, row_start, row_list = frame.rank, frame.row_start, frame.row_list
+def band_pass(rank, bands):
+    """Sort visible triangles by band of rows, rank and index; return the room that needs."""
+    row_start, row_list = bands.start, bands.member
     bins = row_start.shape[0] - 1
-    row_start[:] = 0
+    for k in range(bins + 1):
+        row_start[k] = 0
     for t in range(rank.shape[0]):
         r = rank[t]
         if r > 0:
@@ -549,37 +589,36 @@ def _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, least, mos
         z += gy
 
 
-@kernel(inline=True)
-def _draw_triangle(t, first, last, ranked, corner, box, deep, lane, least, sample):
-    """Draw triangle t into the rows first..last of a band; if it is `ranked` second, ask first whether it is hidden."""
-    lo_x, hi_x = np.int64(box[t, 0]), np.int64(box[t, 1])
-    lo_y, hi_y = max(np.int64(box[t, 2]), first), min(np.int64(box[t, 3]), last)
-    low, most = box[t, 4], box[t, 5]
-    if ranked and _hidden(lo_x >> 2, hi_x >> 2, lo_y - first, hi_y - first, most, least):
-        return
-    x0, y0, x1, y1 = np.int64(corner[t, 0]), np.int64(corner[t, 1]), np.int64(corner[t, 2]), np.int64(corner[t, 3])
-    x2, y2, x3, y3 = np.int64(corner[t, 4]), np.int64(corner[t, 5]), np.int64(corner[t, 6]), np.int64(corner[t, 7])
-    gx, gy = np.int64(deep[t, 0]), np.int64(deep[t, 1])
-    z = np.int64(deep[t, 2] + deep[t, 0] * ((lo_x & ~3) + 0.5) + deep[t, 1] * (lo_y + 0.5))
-    for _ in range(2):
-        if (x0 != x1 or y0 != y1) and (x1 != x2 or y1 != y2):
-            _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, low, most, t, first, lane, sample)
-        x1, y1, x2, y2 = x2, y2, x3, y3
+@kernel
+def _draw_bin(at, first, last, faces, bands, lane, least, sample):
+    """Draw the triangles of a bin into the rows first..last; those of the second rank only where they may be seen."""
+    corner, box, deep = faces.corner, faces.box, faces.deep
+    for k in range(bands.start[at], bands.start[at + 1]):
+        t = bands.member[k]
+        lo_x, hi_x = np.int64(box[t, 0]), np.int64(box[t, 1])
+        lo_y, hi_y = max(np.int64(box[t, 2]), first), min(np.int64(box[t, 3]), last)
+        low, most = box[t, 4], box[t, 5]
+        if at & 1 and _hidden(lo_x >> 2, hi_x >> 2, lo_y - first, hi_y - first, most, least):
+            continue
+        x0, y0, x1, y1 = np.int64(corner[t, 0]), np.int64(corner[t, 1]), np.int64(corner[t, 2]), np.int64(corner[t, 3])
+        x2, y2, x3, y3 = np.int64(corner[t, 4]), np.int64(corner[t, 5]), np.int64(corner[t, 6]), np.int64(corner[t, 7])
+        gx, gy = np.int64(deep[t, 0]), np.int64(deep[t, 1])
+        z = np.int64(deep[t, 2] + deep[t, 0] * ((lo_x & ~3) + 0.5) + deep[t, 1] * (lo_y + 0.5))
+        for _ in range(1 + int(x3 != x2 or y3 != y2)):
+            if (x0 != x1 or y0 != y1) and (x1 != x2 or y1 != y2):
+                _cover(x0, y0, x1, y1, x2, y2, lo_x, hi_x, lo_y, hi_y, z, gx, gy, low, most, t, first, lane, sample)
+            x1, y1, x2, y2 = x2, y2, x3, y3
 
 
 @kernel
-def _cover_band(band, lo, hi, height, frame, lane, least, sample):
+def _cover_band(band, lo, hi, height, faces, bands, lane, least, sample):
     """Clear the blocks lo..hi of one band of rows and draw its triangles into it, those of the first rank first."""
-    corner, box, deep, row_start, row_list = frame.corner, frame.box, frame.deep, frame.row_start, frame.row_list
     first = band * BAND
     last = min(first + BAND, height) - 1
     sample[:, lo : hi + 1] = 0
-    for ranked in range(2):
-        if ranked:
-            _least(lo, hi, sample, least)
-        for k in range(row_start[2 * band + ranked], row_start[2 * band + ranked + 1]):
-            t = row_list[k]
-            _draw_triangle(t, first, last, ranked, corner, box, deep, lane, least, sample)
+    _draw_bin(2 * band, first, last, faces, bands, lane, least, sample)
+    _least(lo, hi, sample, least)
+    _draw_bin(2 * band + 1, first, last, faces, bands, lane, least, sample)
 
 
 @kernel(inline=True)
@@ -587,16 +626,13 @@ def _alike(zi, zj, t, k, item, plane):
     """Whether two samples of a pixel, of triangles t and k with depth numbers zi and zj, may share one colour."""
     if item[t] != item[k] or abs(zi - zj) > SAME_DEPTH * zi:
         return False
-    ax, ay, az = plane[t, 0] + plane[t, 3] + plane[t, 6], plane[t, 1] + plane[t, 4] + plane[t, 7], _ahead(plane, t)
-    bx, by, bz = plane[k, 0] + plane[k, 3] + plane[k, 6], plane[k, 1] + plane[k, 4] + plane[k, 7], _ahead(plane, k)
+    # The rows E_i add up to the normal, divided by the distance of the triangle's plane.
+    ax, bx = plane[t, 0] + plane[t, 3] + plane[t, 6], plane[k, 0] + plane[k, 3] + plane[k, 6]
+    ay, by = plane[t, 1] + plane[t, 4] + plane[t, 7], plane[k, 1] + plane[k, 4] + plane[k, 7]
+    az, bz = plane[t, 2] + plane[t, 5] + plane[t, 8], plane[k, 2] + plane[k, 5] + plane[k, 8]
     turn = plane[t, P_SIDE] * plane[k, P_SIDE] * (ax * bx + ay * by + az * bz)
     square = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz)
     return turn > 0.0 and turn * turn >= SAME_TURN * SAME_TURN * square
-
-
-@kernel(inline=True)
-def _ahead(plane, t):
-    return plane[t, 2] + plane[t, 5] + plane[t, 8]
 
 
 @kernel(inline=True)
@@ -621,8 +657,9 @@ def _split_pixel(x, n, sample, item, plane, whole):
 @kernel
 def _list_row(lo, hi, sample, item, plane, whole, nearest):
     """List the fragments of blocks lo..hi of a row of samples, from left to right; return how many there are."""
-    n = 0
-    nearest[:] = 0
+    n = np.int64(0)  # as a literal it would be compiled for twice
+    for x in range(nearest.shape[0]):
+        nearest[x] = 0
     for x in range(4 * lo, min(4 * hi + 4, nearest.shape[0])):
         at = 2 * BLOCK * (x >> 2) + 4 * (x & 3)
         z0, z1, z2, z3 = load(sample, at), load(sample, at + 1), load(sample, at + 2), load(sample, at + 3)
@@ -653,31 +690,31 @@ def _extent(band, row_start, row_list, box, width):
 
 
 @kernel
-def _cover_and_list(band, slot, listed, item, frame):
+def _cover_and_list(band, slot, listed, item, faces, bands, samples, seen):
     """`coverage_pass` for one band, by the thread of that slot."""
-    width, height = frame.nearest.shape[1], frame.nearest.shape[0]
-    sample = frame.sample[slot if listed else band]
+    height, width = seen.nearest.shape
+    sample = samples.sample[slot if listed else band]
     lo, hi = 0, sample.shape[1] - 1
     if listed:
-        lo, hi = _extent(band, frame.row_start, frame.row_list, frame.box, width)
-    _cover_band(band, lo, hi, height, frame, frame.lane[slot], frame.least[slot], sample)
+        lo, hi = _extent(band, bands.start, bands.member, faces.box, width)
+    _cover_band(band, lo, hi, height, faces, bands, samples.lane[slot], samples.least[slot], sample)
     if listed:
-        plane, fragment, found, nearest = frame.plane, frame.fragment, frame.found, frame.nearest
+        plane, fragment, found, nearest = faces.plane, seen.fragment, seen.found, seen.nearest
         for y in range(band * BAND, min((band + 1) * BAND, height)):
             found[y] = _list_row(lo, hi, sample[y - band * BAND], item, plane, fragment[y], nearest[y])
 
 
 @kernel(parallel=True)
-def coverage_pass(order, listed, item, frame, shadow):
+def coverage_pass(order, listed, item, faces, bands, samples, seen, depths):
     """Find the nearest triangle of every sample, band by band, and blur the shadow's depth, strip by strip.
 
     order : (k,) deals out the work to the threads: bands, then strips of the shadow
     listed : list fragments and nearest depths, samples live in the slot of the thread; else keep them, band b in slot b
     """
-    bands = frame.row_start.shape[0] // 2
+    count = bands.start.shape[0] // 2
     for k in prange(order.shape[0]):
         b, slot = order[k], get_thread_id()
-        if b >= bands:
-            moment_strip(b - bands, shadow)
+        if b >= count:
+            moment_strip(b - count, depths)
         else:
-            _cover_and_list(b, slot, listed, item, frame)
+            _cover_and_list(b, slot, listed, item, faces, bands, samples, seen)

@@ -5,7 +5,7 @@ widest, as light that entered skin comes out redder), a microfacet highlight, an
 by occlusion. Occlusion is stored per vertex; eyes, teeth and tongue add a contact shade taken from the depth samples.
 
 A row of pixels is worked off in stages over a small table of its fragments: interpolate their attributes, look up the
-texture and the shadow, light them (vector instructions), add them up. `whole` is the row of `Frame.fragment`.
+texture and the shadow, light them (vector instructions), add them up. `whole` is the row of `Seen.fragment`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numba import get_thread_id  # type: ignore[attr-defined]
 
 from faceanim.ground.jit import kernel, prange
-from faceanim.kernels.lanes import mix8
+from faceanim.kernels.lanes import LANES, mix8
 from faceanim.kernels.memory import STORE, load
 from faceanim.kernels.raster import (
     BAND,
@@ -65,10 +65,10 @@ store0, store1, store2 = STORE[0], STORE[1], STORE[2]
 @kernel
 def _attribute_row(n, ry, centre, focal, triangle, vertex, plane, whole, number):
     """Interpolate what the vertices carry at the n fragments of a row, all in float32."""
-    cap, step = number.shape[1], _1 / focal
+    cap, step, columns = number.shape[1], _1 / focal, plane.shape[1]
     for i in range(n):
         t = load(whole, W_TRIANGLE * cap + i)
-        p = 16 * t
+        p = columns * t
         rx = (np.float32(load(whole, W_PIXEL * cap + i)) + _HALF - centre) * step
         # A pixel centre beside a triangle that covers only some samples takes the value of the nearest corner or edge.
         w0 = max(load(plane, p) * rx + load(plane, p + 1) * ry + load(plane, p + 2), _0)
@@ -76,7 +76,7 @@ def _attribute_row(n, ry, centre, focal, triangle, vertex, plane, whole, number)
         w2 = max(load(plane, p + 6) * rx + load(plane, p + 7) * ry + load(plane, p + 8), _0)
         total = _1 / max(w0 + w1 + w2, _LEAST)
         w0, w1, w2 = w0 * total, w1 * total, w2 * total
-        a, b, c = 8 * load(triangle, 3 * t), 8 * load(triangle, 3 * t + 1), 8 * load(triangle, 3 * t + 2)
+        a, b, c = LANES * load(triangle, 3 * t), LANES * load(triangle, 3 * t + 1), LANES * load(triangle, 3 * t + 2)
         mix8(number, i, cap, vertex, a, b, c, w0, w1, w2)
         store0(number, A_MIP * cap + i, load(plane, p + P_MIP))
         store0(number, A_SIDE * cap + i, load(plane, p + P_SIDE))
@@ -303,13 +303,13 @@ def _resolve_row(n, back, table, whole, number, row):
     """Write a row of bytes (w, 3): fragments weighted by their samples, over the linear colour `back` (3,)."""
     r0, g0, b0 = np.float32(back[0]), np.float32(back[1]), np.float32(back[2])
     empty = _encoded(table, r0, g0, b0)
-    i, end = 0, 0
+    i, end = 0, np.int64(0)
     while i < n:
         x = np.int64(whole[W_PIXEL, i])
         _fill(end, x, empty, row)
         end = x + 1
         if whole[W_SAMPLES, i] == 4:
-            _fill(x, end, whole[W_TRIANGLE, i], row)
+            _fill(x, end, np.int64(whole[W_TRIANGLE, i]), row)
             i += 1
             continue
         red, green, blue, rest = _0, _0, _0, _1
@@ -335,24 +335,24 @@ def _blend_row(n, opacity, table, whole, number, row):
 
 
 @kernel
-def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number, out):
+def _shade_band(band, opacity, mesh, camera, vertex, plane, seen, paint, shadow, step, number, out):
     """Colour one band of rows; over the background, or over `out` if opacity is not negative."""
-    triangle, item, plane, material = mesh.triangle, mesh.item, frame.plane, paint.material
+    triangle, item, material = mesh.triangle, mesh.item, paint.material
     row32, table, bias = paint.material32, paint.encode, np.float32(shadow.bias)
     centre, focal = np.float32(camera[C_X]), np.float32(camera[C_FOCAL])
     for y in range(band * BAND, min((band + 1) * BAND, out.shape[0])):
         ry = (camera[C_Y] - y - 0.5) / camera[C_FOCAL]
         height = np.float32(ry)
-        n, whole = frame.found[y], frame.fragment[y]
-        _attribute_row(n, height, centre, focal, triangle, frame.vertex, plane, whole, number)
-        first = 0
+        n, whole = seen.found[y], seen.fragment[y]
+        _attribute_row(n, height, centre, focal, triangle, vertex, plane, whole, number)
+        first = np.int64(0)  # as a literal it would be compiled for twice
         while first < n:
             m, last = item[whole[W_TRIANGLE, first]], first + 1
             while last < n and item[whole[W_TRIANGLE, last]] == m:
                 last += 1
             colour, row = A_RED, material[m]
             if row[M_SHADE_RADIUS] > 0.0:
-                _contact_run(first, last, y, camera, row, step, frame.nearest, whole, number)
+                _contact_run(first, last, y, camera, row, step, seen.nearest, whole, number)
             if row[M_SOURCE] == 1.0:
                 k = int(row[M_TEXTURE])
                 top, colour = np.float32(paint.level_count[k] - 1), A_TEXTURE
@@ -375,7 +375,7 @@ def _shade_band(band, opacity, mesh, camera, frame, paint, shadow, step, number,
 
 
 @kernel(parallel=True)
-def shade_pass(order, opacity, mesh, camera, frame, paint, shadow, step, number, out):
+def shade_pass(order, opacity, mesh, camera, vertex, plane, seen, paint, shadow, step, number, out):
     """Write the picture `out` (h, w, 3) sRGB bytes; bands are dealt out as in `coverage_pass`.
 
     opacity : in [0, 1] blends over what `out` holds, negative draws over the background
@@ -384,4 +384,4 @@ def shade_pass(order, opacity, mesh, camera, frame, paint, shadow, step, number,
     """
     for k in prange(order.shape[0]):
         b = order[k]
-        _shade_band(b, opacity, mesh, camera, frame, paint, shadow, step, number[get_thread_id()], out)
+        _shade_band(b, opacity, mesh, camera, vertex, plane, seen, paint, shadow, step, number[get_thread_id()], out)

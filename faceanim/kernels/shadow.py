@@ -18,13 +18,12 @@ STRIP = 16  # rows
 BLUR = 2  # neighbours on each side over which moments are averaged
 
 
-class Shadow(NamedTuple):
-    """The key light's shadow; places in its map are (right [pixel], down [pixel], depth beyond the middle [mm]).
+class Caster(NamedTuple):
+    """What throws the shadow, seen from the light.
 
-    triangle : (c, 3) vertices of the triangles that throw it   casts : (items,)
-    to_map : (3, 4) from the head frame to the map   spot : (n, 4) places of the vertices
-    depth : (pieces, s, s), `far` where nothing is   moment : (s, s, 2)   spare : (strips, 3, rows, columns) work space
-    to_light : (12,) from camera space to the map, row by row   bias : [mm], 0 = no shadow
+    Places in the map are (right [pixel], down [pixel], depth beyond the middle [mm]).
+    triangle : (c, 3) vertices   casts : (items,)   to_map : (3, 4) from the head frame to the map
+    spot : (n, 4) places of the vertices   depth : (pieces, s, s), `far` where nothing is
     """
 
     triangle: np.ndarray
@@ -32,10 +31,26 @@ class Shadow(NamedTuple):
     to_map: np.ndarray
     spot: np.ndarray
     depth: np.ndarray
+    far: float
+
+
+class Depths(NamedTuple):
+    """Depth of the caster's pieces, and the moments (s, s, 2) made of it; spare : (strips, 3, rows, columns)."""
+
+    depth: np.ndarray
     moment: np.ndarray
     spare: np.ndarray
-    to_light: np.ndarray
     far: float
+
+
+class Shadow(NamedTuple):
+    """What shading needs to know: moment (s, s, 2), to_light (12,) from camera space to the map, row by row.
+
+    bias : [mm], 0 = no shadow
+    """
+
+    moment: np.ndarray
+    to_light: np.ndarray
     bias: float
 
 
@@ -72,11 +87,13 @@ def _cast_triangle(x0, y0, z0, x1, y1, z1, x2, y2, z2, depth):
 
 
 @kernel
-def cast_piece(piece, shadow):
+def cast_piece(piece, caster):
     """Draw one piece of the caster, every so-manieth chunk of its triangles, into its own map."""
-    triangle, spot, depth = shadow.triangle, shadow.spot, shadow.depth[piece]
-    depth[:] = np.float32(shadow.far)
-    stride = 64 * shadow.depth.shape[0]
+    triangle, spot, depth = caster.triangle, caster.spot, caster.depth[piece]
+    for y in range(depth.shape[0]):
+        for x in range(depth.shape[1]):
+            depth[y, x] = caster.far
+    stride = 64 * caster.depth.shape[0]
     for first in range(64 * piece, triangle.shape[0], stride):
         for t in range(first, min(first + 64, triangle.shape[0])):
             a, b, c = triangle[t, 0], triangle[t, 1], triangle[t, 2]
@@ -113,14 +130,15 @@ def _gather_row(y, far, depth, count, mean, square):
 
 
 @kernel
-def _blur_down(row):
-    """Sum rows j..j + 2 BLUR into row j, for all rows that have so many after them."""
-    for j in range(row.shape[0] - 2 * BLUR):
-        for x in range(row.shape[1]):
-            total = row[j, x]
-            for k in range(1, 2 * BLUR + 1):
-                total += row[j + k, x]
-            row[j, x] = total
+def _blur_down(table):
+    """In each table of rows (tables, rows, columns), sum rows j..j + 2 BLUR into row j, while so many are left."""
+    for c in range(table.shape[0]):
+        for j in range(table.shape[1] - 2 * BLUR):
+            for x in range(table.shape[2]):
+                total = table[c, j, x]
+                for k in range(1, 2 * BLUR + 1):
+                    total += table[c, j + k, x]
+                table[c, j, x] = total
 
 
 @kernel
@@ -142,16 +160,14 @@ def _blur_across(far, count, mean, square, moment):
 
 
 @kernel
-def moment_strip(strip, shadow):
-    """Moments of one strip of rows; where nothing is there is no shadow."""
-    depth, moment, size, far = shadow.depth, shadow.moment, shadow.moment.shape[0], np.float32(shadow.far)
-    count, mean, square = shadow.spare[strip, 0], shadow.spare[strip, 1], shadow.spare[strip, 2]
+def moment_strip(strip, depths):
+    """Moments of one strip of rows; where nothing is there is no depths."""
+    depth, moment, size, far = depths.depth, depths.moment, depths.moment.shape[0], np.float32(depths.far)
+    count, mean, square = depths.spare[strip, 0], depths.spare[strip, 1], depths.spare[strip, 2]
     first, last = strip * STRIP, min((strip + 1) * STRIP, size)
     for j in range(STRIP + 2 * BLUR):
         _gather_row(min(max(first + j - BLUR, 0), size - 1), far, depth, count[j], mean[j], square[j])
-    _blur_down(count)
-    _blur_down(mean)
-    _blur_down(square)
+    _blur_down(depths.spare[strip])
     for y in range(first, last):
         _blur_across(far, count[y - first], mean[y - first], square[y - first], moment[y])
 

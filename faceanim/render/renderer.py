@@ -9,14 +9,13 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from faceanim.ground.arrays import Floats, Ints, floats, ints
 from faceanim.ground.errors import RunError, UserError
 from faceanim.kernels import raster, shade
 from faceanim.render.camera import Camera
 from faceanim.render.shading import Bytes, Look, Material, Texture, linear, paint_tables
-from faceanim.render.shadow import aim, shadow_tables, strips
+from faceanim.render.shadow import ShadowMap
 
 BAND_COST, STRIP_COST = 60, 80
 """What clearing and listing a band, and blurring a strip of the shadow, cost, in triangles drawn."""
@@ -98,6 +97,7 @@ class _Scene:
     """The items as one mesh; `point` (items + 1,) and `vertex` (items + 1,) where each begins; uv (n, 2)."""
 
     mesh: raster.Mesh
+    fans: raster.Fans
     point: Ints
     vertex: Ints
     uv: Floats
@@ -107,7 +107,7 @@ def _joined(items: Sequence[DrawItem]) -> _Scene:
     splits = [_split(item) for item in items]
     point = np.cumsum([0] + [len(item.points) for item in items]).astype(np.int32)
     vertex = np.cumsum([0] + [len(origin) for origin, _, _ in splits]).astype(np.int32)
-    start, fan = _fans(np.concatenate([q.triangles + p for q, p in zip(items, point, strict=False)]), int(point[-1]))
+    start, edge = _fans(np.concatenate([q.triangles + p for q, p in zip(items, point, strict=False)]), int(point[-1]))
     origin = np.concatenate([s[0] + p for s, p in zip(splits, point, strict=False)])
     first, count = start[origin], np.diff(start)[origin]
     end = np.cumsum(count)
@@ -116,14 +116,16 @@ def _joined(items: Sequence[DrawItem]) -> _Scene:
     mesh = raster.Mesh(
         triangle=np.concatenate([s[1] + v for s, v in zip(splits, vertex, strict=False)]).astype(np.int32),
         item=np.repeat(number, [len(item.triangles) for item in items]),
+        texels=np.concatenate([_texels(s[1], s[2], q.material.texture) for q, s in zip(items, splits, strict=True)]),
+    )
+    fans = raster.Fans(
         owner=np.repeat(number, np.diff(vertex)),
         origin=origin.astype(np.int32),
         start=np.concatenate([[0], end]).astype(np.int32),
-        fan=fan[take],
-        texels=np.concatenate([_texels(s[1], s[2], q.material.texture) for q, s in zip(items, splits, strict=True)]),
+        edge=edge[take],
     )
     uv = np.concatenate([np.zeros((len(origin), 2)) if uv is None else uv for origin, _, uv in splits])
-    return _Scene(mesh, point, vertex, uv)
+    return _Scene(mesh, fans, point, vertex, uv)
 
 
 def _contact_steps() -> Floats:
@@ -179,27 +181,33 @@ class Renderer:
         self.layer_opacity = layer_opacity
         self._layers = sorted({item.material.layer for item in items})
         self._scene = _joined(self.items)
-        self._mesh, self._points = self._scene.mesh, np.concatenate([item.points for item in items])
-        slots = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        self._frame = raster.buffers(len(self._mesh.origin), len(self._mesh.triangle), width, height, slots)
+        self._mesh, self._fans = self._scene.mesh, self._scene.fans
+        self._points = np.concatenate([item.points for item in items])
+        self._threads = int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+        self._placed = raster.placed_buffers(len(self._fans.origin))
+        self._faces = raster.face_buffers(len(self._mesh.triangle))
+        self._bands = raster.band_buffers(height, 4 * len(self._mesh.triangle) + 64)
+        self._samples = raster.sample_buffers(self._threads, width)
+        self._seen = raster.seen_buffers(width, height)
         self._paint = paint_tables([item.material for item in items], self.look, height)
         self._steps = _contact_steps()
         self._moved = np.ones(len(items), np.bool_)
         self._poses: list[Floats | None] = [None] * len(items)
-        self._number = np.zeros((slots, shade.N_NUMBER, raster.row_length(width)), np.float32)
-        casts = np.array([self.look.shadow and q.material.casts and q.material.layer == 0 for q in items])
-        self._shadow = shadow_tables(self._mesh, casts)
-        self._caster = np.concatenate(
-            [q.points[q.triangles.ravel()] for q, c in zip(items, casts, strict=True) if c] or [np.zeros((0, 3))]
-        )
-        self._samples: NDArray[np.int32] | None = None
+        self._number = np.zeros((self._threads, shade.N_NUMBER, raster.row_length(width)), np.float32)
+        self._shadow = self._shadow_map()
+        self._kept: raster.Samples | None = None
         self._out = np.zeros((height, width, 3), np.uint8)
         self.camera = camera
         for i, item in enumerate(self.items):
             self.set_occlusion(i, 1.0 if item.occlusion is None else item.occlusion)
             self.set_colour(i, item.material.colour if item.vertex_colour is None else item.vertex_colour)
             if item.material.texture is not None and not item.material.vertex_colour:
-                self._frame.vertex[self._vertices(i), 4:6] = self._scene.uv[self._vertices(i)]
+                self._placed.vertex[self._vertices(i), 4:6] = self._scene.uv[self._vertices(i)]
+
+    def _shadow_map(self) -> ShadowMap:
+        casts = np.array([self.look.shadow and q.material.casts and q.material.layer == 0 for q in self.items])
+        points = [q.points[q.triangles.ravel()] for q, c in zip(self.items, casts, strict=True) if c]
+        return ShadowMap(self._mesh, casts, np.concatenate([np.zeros((0, 3)), *points]), len(self._fans.origin))
 
     @property
     def camera(self) -> Camera:
@@ -211,8 +219,7 @@ class Renderer:
         self._camera = camera
         self._numbers = camera.numbers(*self.size)
         self._moved[:] = True
-        if self._shadow.casts.any():
-            self._shadow = aim(self._shadow, self._caster, camera, self._paint.light[0, :3].astype(np.float64))
+        self._shadow.aim(camera, self._paint.light[0, :3].astype(np.float64))
 
     def _slice(self, item: int) -> slice:
         return slice(int(self._scene.point[item]), int(self._scene.point[item + 1]))
@@ -222,16 +229,16 @@ class Renderer:
 
     def _spread(self, item: int, values: Any) -> Any:
         """Values of an item's vertices, from those of its points (n, ...)."""
-        return np.asarray(values)[self._mesh.origin[self._vertices(item)] - self._scene.point[item]]
+        return np.asarray(values)[self._fans.origin[self._vertices(item)] - self._scene.point[item]]
 
     def set_occlusion(self, item: int, value: Any) -> None:
         """Set how open to light the points of an item are, (n,) or one number in [0, 1]."""
-        self._frame.vertex[self._vertices(item), 3] = value if np.ndim(value) == 0 else self._spread(item, value)
+        self._placed.vertex[self._vertices(item), 3] = value if np.ndim(value) == 0 else self._spread(item, value)
 
     def set_colour(self, item: int, colour: Any) -> None:
         """Set the colours of an item's points, (n, 3) or one, sRGB in [0, 1]; has no effect under a texture."""
         light = linear(colour)
-        self._frame.vertex[self._vertices(item), 4:7] = light if light.ndim == 1 else self._spread(item, light)
+        self._placed.vertex[self._vertices(item), 4:7] = light if light.ndim == 1 else self._spread(item, light)
 
     def _place(self, points: Mapping[int, Any] | Sequence[Any] | None, bone_pose: Any) -> None:
         given = points if isinstance(points, Mapping) else dict(enumerate(points or ()))
@@ -252,18 +259,20 @@ class Renderer:
 
     def _cover(self, layer: int, listed: bool = True) -> None:
         """Find what is seen of one layer: the list of fragments, or (not `listed`) all samples."""
-        cast = layer == self._layers[0] and bool((self._moved & self._shadow.casts).any())
+        cast = layer == self._layers[0] and self._shadow.moved(self._moved)
         if len(self._layers) > 1:  # what the other layer left in the tables is of no use
             self._moved[:] = True
-        tables = (self._numbers, self._mesh, self._frame, self._paint)
-        raster.setup_pass(float(layer), self._moved, *tables, cast, self._shadow)
+        tables = (self._numbers, self._mesh, self._placed, self._faces, self._paint.material)
+        raster.setup_pass(float(layer), self._moved, *tables, cast, self._shadow.caster)
         self._moved[:] = False
-        if raster.band_pass(self._frame) > len(self._frame.row_list):
-            self._frame = raster.longer_list(self._frame)
-            raster.band_pass(self._frame)
-        cost = np.diff(self._frame.row_start[::2]) + BAND_COST
-        order = dealt(np.append(cost, np.full(strips(self._shadow) if cast else 0, STRIP_COST)))
-        raster.coverage_pass(order, listed, self._mesh.item, self._frame, self._shadow)
+        need = raster.band_pass(self._faces.rank, self._bands)
+        if need > len(self._bands.member):
+            self._bands = raster.band_buffers(self.size[1], int(1.5 * need))
+            raster.band_pass(self._faces.rank, self._bands)
+        cost = np.diff(self._bands.start[::2]) + BAND_COST
+        order = dealt(np.append(cost, np.full(self._shadow.strips if cast else 0, STRIP_COST)))
+        tail = (self._faces, self._bands, self._samples, self._seen, self._shadow.depths)
+        raster.coverage_pass(order, listed, self._mesh.item, *tail)
 
     def _prepare(self) -> None:
         """Normals and projection of all vertices."""
@@ -271,21 +280,21 @@ class Renderer:
             bad = int(np.argmax(~np.isfinite(self._points).all(axis=1)))
             item = int(np.searchsorted(self._scene.point, bad, side="right")) - 1
             raise RunError(f"vertex {bad - self._scene.point[item]} of item {item} has a position that is not finite")
-        raster.place_pass(self._moved, self._mesh, self._points, self._numbers, self._frame, self._shadow)
+        raster.place_pass(self._moved, self._fans, self._points, self._numbers, self._placed, self._shadow.caster)
 
     def depth(self) -> Floats:
         """Return the depth [mm] of the four samples of each pixel as last placed, (h, w, 4), inf where nothing is."""
         self._prepare()
         width, height = self.size
-        kept, bands = self._frame.sample, len(self._frame.row_start) // 2
-        if self._samples is None:
-            self._samples = raster.sample_buffer(bands, width)
-        self._frame = self._frame._replace(sample=self._samples)
+        used, bands = self._samples, len(self._bands.start) // 2
+        if self._kept is None:
+            self._kept = raster.sample_buffers(bands, width, self._threads)
+        self._samples = self._kept
         try:
             self._cover(self._layers[0], listed=False)
         finally:
-            self._frame = self._frame._replace(sample=kept)
-        number = self._samples[..., : raster.BLOCK].reshape(bands * raster.BAND, -1, 4)[:height, :width]
+            self._samples = used
+        number = self._kept.sample[..., : raster.BLOCK].reshape(bands * raster.BAND, -1, 4)[:height, :width]
         with np.errstate(divide="ignore"):
             return raster.DEEPEST * self.camera.near / number
 
@@ -302,7 +311,8 @@ class Renderer:
         for layer in self._layers:
             self._cover(layer)
             opacity = -1.0 if layer == self._layers[0] else self.layer_opacity
-            tail = (self._frame, self._paint, self._shadow, self._steps, self._number, self._out)
-            order = dealt(np.add.reduceat(self._frame.found, np.arange(0, self.size[1], raster.BAND)))
-            shade.shade_pass(order, opacity, self._mesh, self._numbers, *tail)
+            order = dealt(np.add.reduceat(self._seen.found, np.arange(0, self.size[1], raster.BAND)))
+            seen = (self._placed.vertex, self._faces.plane, self._seen)
+            tail = (self._paint, self._shadow.shadow, self._steps, self._number, self._out)
+            shade.shade_pass(order, opacity, self._mesh, self._numbers, *seen, *tail)
         return self._out

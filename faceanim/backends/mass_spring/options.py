@@ -51,7 +51,7 @@ class Options:
     secant: bool = True
     safety: float = 0.8
     newton_tolerance: float = 1e-4
-    newton_most: int = 200
+    newton_most: int = 400
 
     def __post_init__(self) -> None:
         for kind, value, known in (

@@ -19,7 +19,7 @@ from faceanim.ground.jit import user_cache, writable_folder
 STATIC, QUASI_STATIC, DYNAMIC = 0, 1, 2
 FAINT = 0.05
 """Share of a muscle's strongest pull per area at which its zone ends."""
-_VERSION = b"2"
+_VERSION = b"3"
 
 
 @dataclass(frozen=True, eq=False)
