@@ -311,8 +311,8 @@ class SolverMassSpring:
         farthest = max(float(state.q.max(initial=0.0)), -float(state.q.min(initial=0.0)))
         if not farthest < self._horizon:
             remedy = {
-                "paper": "this scheme is unstable for large steps: use scheme='block_descent' or a smaller step",
-                "explicit": "lower `safety` or use scheme='block_descent'",
+                "paper": "this scheme is unstable for large steps: use scheme='conjugate_gradient' or a smaller step",
+                "explicit": "lower `safety` or use scheme='conjugate_gradient'",
             }.get(self.options.scheme, "use a smaller step or more sweeps, or lower the activations")
             raise DivergenceError(
                 f"the skin ran away (farthest vertex {farthest:.3g} mm) at t = {state.t:.4g} s with scheme "
