@@ -16,7 +16,9 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--face", default="default", help="name of the face (default: %(default)s)")
     group.add_argument("--density", default="default", help="coarse, default or fine")
     group.add_argument("--backend", default="mass_spring", help="how flesh answers (default: %(default)s)")
-    group.add_argument("--scheme", help="time stepping: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper")
+    group.add_argument(
+        "--scheme", help="time stepping: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper"
+    )
     which = group.add_mutually_exclusive_group()
     which.add_argument("--adaptive", dest="adaptive", action="store_true", default=None,
                        help="dynamic, quasi-static and static vertices (default)")  # fmt: skip
