@@ -54,7 +54,10 @@ class Drawing:
         self.session, self.picture = session, picture
         self._values = _values_of(session, picture.colour)
         rest = session.body.surface.points
-        bounds = np.concatenate([rest, *moments]) if len(moments) else rest
+        bounds = rest
+        if len(moments):
+            # Each vertex's box over time is enough to frame the picture.
+            bounds = np.concatenate([rest, np.min(moments, axis=0), np.max(moments, axis=0)])
         scale = None
         if picture.colour in ("displacement", "strain"):
             scale = _scale(picture.colour, [self._values(points) for points in moments])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -188,7 +189,8 @@ def encode_table() -> Bytes:
     return np.round(255.0 * srgb(np.where(x > 0.8, 0.8 + 0.2 * (1.0 - np.exp(-over / 0.2)), x))).astype(np.uint8)
 
 
-def _texel_tables(textures: Sequence[Texture]) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
+@lru_cache(maxsize=4)
+def _texel_tables(textures: tuple[Texture, ...]) -> tuple[NDArray[np.uint32], NDArray[np.int32], NDArray[np.int32]]:
     """Pack all mip levels: words of three 10-bit square roots, (first, width, height) of each level, their number."""
     root = np.round(1023.0 * np.sqrt(linear(np.arange(256) / 255.0))).astype(np.uint32)
     count = np.array([len(t.levels) for t in textures] or [0], dtype=np.int32)
@@ -209,7 +211,7 @@ def paint_tables(materials: Sequence[Material], look: Look, height: int) -> k.Pa
     """Pack materials (one row each), their textures, the lights and the background for the kernels."""
     textures: list[Texture] = []
     rows = np.array([m.row(textures) for m in materials])
-    texel, level, count = _texel_tables(textures)
+    texel, level, count = _texel_tables(tuple(textures))
     light = look.lighting
     return k.Paint(
         material=np.ascontiguousarray(rows),

@@ -317,11 +317,12 @@ def _pair_lists(body: Body) -> tuple[Ints, Ints, Ints, Floats]:
     looks = body.surface.vertex_normals
     faces = body.surface.normals_by_area / np.maximum(body.surface.areas[:, None], 1e-300)
     adjacent = topology.neighbours(corners, len(points))
+    neighbours = [adjacent.of(i).tolist() for i in range(len(points))]
     for pair in body.pairs:
         for c, i in enumerate(pair.node):
             mine = pair.triangle[pair.start[c] : pair.start[c + 1]]
             mine = mine[faces[mine] @ looks[i] < FACING]
-            mine = mine[~np.isin(corners[mine], _around(adjacent, int(i))).any(axis=1)].astype(np.int32)
+            mine = mine[~np.isin(corners[mine], _around(neighbours, int(i))).any(axis=1)].astype(np.int32)
             keep = np.zeros(len(mine), dtype=bool)
             contact.in_front(points, corners, int(i), mine, BEHIND, TOUCHING, keep)
             if keep.any():
@@ -337,12 +338,13 @@ def _pair_lists(body: Body) -> tuple[Ints, Ints, Ints, Floats]:
     )
 
 
-def _around(adjacent: topology.Lists, i: int) -> Ints:
+def _around(neighbours: list[list[int]], i: int) -> list[int]:
     """Return the vertices within `RINGS` edges of vertex `i`, with itself."""
-    found = np.array([i], dtype=np.int32)
+    found = ring = {i}
     for _ in range(RINGS):
-        found = np.unique(np.concatenate([found, *(adjacent.of(int(j)) for j in found)]))
-    return found
+        ring = {k for j in ring for k in neighbours[j]} - found
+        found = found | ring
+    return list(found)
 
 
 def _local_fibres(body: Body, local: Ints, m: int, n: int) -> Fibres:
