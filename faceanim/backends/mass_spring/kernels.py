@@ -85,6 +85,23 @@ def extrapolate(x, v, h, least):
 
 
 @kernel
+def second_difference(new, now, before, m, out):
+    """Write new - 2 now + before of the first `m` rows into `out`, all (n, 3)."""
+    for i in range(m):
+        for d in range(3):
+            out[i, d] = new[i, d] - 2.0 * now[i, d] + before[i, d]
+
+
+@kernel
+def add_once(x, lead, m):
+    """Add the first `m` rows of `lead` to `x` (n, 3) and clear them."""
+    for i in range(m):
+        for d in range(3):
+            x[i, d] += lead[i, d]
+            lead[i, d] = 0.0
+
+
+@kernel
 def fastest(v, nodes):
     """Return the largest speed of `nodes` among the velocities `v` (n, 3)."""
     worst = 0.0

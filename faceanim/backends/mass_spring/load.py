@@ -41,6 +41,8 @@ class Load:
             np.zeros((n, 3)),
         )
         self.activation = np.zeros(patch.muscles)
+        self.lead = np.zeros((n, 3))
+        self._anchors = np.zeros((2, n, 3))
         self.scratch = force_scratch(patch.scene.springs)
 
     def apply(self, control: Control) -> None:
@@ -66,6 +68,18 @@ class Load:
         scene, near = self.patch.scene, reach if pair_reach is None else pair_reach
         contact.find(x, scene.colliders, scene.grids, self.moment.pose, reach, near, self.moment.planes)
 
+    def follow(self, pose: Floats, pose_before: Floats) -> None:
+        """Note by how much the bones speed up, from their poses now and one step before: the skin's guess follows.
+
+        lead = anchor next - 2 anchor now + anchor before; `ahead` adds it once.
+        """
+        new = self.moment.pose
+        if np.array_equal(new, pose) and np.array_equal(new, pose_before):
+            return
+        for k, known in enumerate((pose, pose_before)):
+            attachment.carry(self.patch.scene.tethers, known, self._anchors[k])
+        kernels.second_difference(self.moment.anchor, self._anchors[0], self._anchors[1], self.patch.m, self.lead)
+
     def ahead(self, v: Floats, h: float, least: float, reach: float, pair_reach: float) -> None:
         """Move `x` on by h v and find the contacts for the step: those of lips and lids where it starts, still apart."""
         scene, moment, x = self.patch.scene, self.moment, self.x
@@ -73,6 +87,7 @@ class Load:
         near = min(pair_reach, NEAREST + 2.0 * way)
         moment.planes.count[1] = contact.find_pairs(x, scene.colliders, near, 0, moment.planes)
         kernels.extrapolate(x, v, h, least)
+        kernels.add_once(x, self.lead, self.patch.m)
         contact.hold_back(x, scene.free, moment.planes)
         kernels.reflect(x, self.patch.half)
         contact.find_rigid(x, scene.colliders, scene.grids, moment.pose, reach, moment.planes)

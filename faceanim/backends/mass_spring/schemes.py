@@ -47,12 +47,14 @@ OMEGA = 1.5
 class Motion:
     """What a scheme reads and writes: the body's positions and velocities, now, one step earlier and new, (n, 3).
 
-    `t` [s] is the time now, `dt_before` [s] the earlier step, 0 = there is none.
+    `t` [s] is the time now, `dt_before` [s] the earlier step, 0 = there is none; `pose`, `pose_before` of the bones.
     """
 
     def __init__(self, n: int) -> None:
         self.q = self.qd = self.q_before = self.qd_before = np.zeros((0, 3))
         self.t = self.dt_before = 0.0
+        self.pose: Floats | None = None
+        self.pose_before: Floats | None = None
         self.q_new = np.zeros((n, 3))
         self.qd_new = np.zeros((n, 3))
 
@@ -107,6 +109,8 @@ class _Implicit(_Patchwise):
             motion.q, motion.qd, motion.q_before, motion.qd_before, patch.nodes, patch.mass, patch.m, self.drag, gamma,
             now, before, self.centre, self.weight,
         )  # fmt: skip
+        if motion.pose is not None and motion.pose_before is not None and abs(h - motion.dt_before) < 1e-3 * h:
+            self.load.follow(motion.pose, motion.pose_before)
         self.load.ahead(self.v, h, self.options.sweep_tolerance, REACH, PAIR_REACH)
         self._minimise(gamma, report)
         kernels.finish(

@@ -31,16 +31,20 @@ class StateMassSpring(State):
     """Positions `q` (n, 3) [mm] and velocities `qd` (n, 3) [mm/s], with the step before for two-step schemes.
 
     q_before, qd_before : the same one step earlier;  dt_before : that step [s], 0 = none yet
+    pose, pose_before : (n_bone, 4, 4) of the bones at these two times, None = not known
     """
 
     q_before: Floats | None = None
     qd_before: Floats | None = None
     dt_before: float = 0.0
+    pose: Floats | None = None
+    pose_before: Floats | None = None
 
     def copy(self) -> StateMassSpring:
         """Return an independent copy."""
-        before = [None if a is None else a.copy() for a in (self.q_before, self.qd_before)]
-        return StateMassSpring(self.q.copy(), self.qd.copy(), self.t, before[0], before[1], self.dt_before)
+        known = (self.q_before, self.qd_before, self.pose, self.pose_before)
+        q, qd, pose, pose_before = (None if a is None else a.copy() for a in known)
+        return StateMassSpring(self.q.copy(), self.qd.copy(), self.t, q, qd, self.dt_before, pose, pose_before)
 
 
 class Pins:
@@ -208,7 +212,7 @@ class SolverMassSpring:
             self._quasi_static.load.apply(control)
             self._quasi_static.advance(self._motion, dt, report)
         done = perf_counter()
-        self._commit(state_in, state_out, dt)
+        self._commit(state_in, state_out, dt, control)
         report.seconds["dynamic"] = between - started
         report.seconds["quasi_static"] = done - between
         report.seconds["rest"] = perf_counter() - done
@@ -292,11 +296,15 @@ class SolverMassSpring:
         motion.q_before = before if before is not None and known else state.q
         motion.qd_before = rate if rate is not None and known else state.qd
         motion.dt_before = getattr(state, "dt_before", 0.0) if known else 0.0
+        motion.pose, motion.pose_before = getattr(state, "pose", None), getattr(state, "pose_before", None)
         motion.q_new[:] = state.q
         motion.qd_new[:] = 0.0
 
-    def _commit(self, state_in: State, state_out: State, dt: float) -> None:
+    def _commit(self, state_in: State, state_out: State, dt: float, control: Control) -> None:
         motion = self._motion
+        if isinstance(state_out, StateMassSpring):
+            state_out.pose_before = motion.pose
+            state_out.pose = control.bone_pose.copy()
         if isinstance(state_out, StateMassSpring):
             if state_out.q_before is None or state_out.qd_before is None:
                 state_out.q_before, state_out.qd_before = np.empty_like(state_in.q), np.empty_like(state_in.q)
