@@ -2,8 +2,8 @@
 
 The shear layer and the tethers act alike in all directions, and the membrane nearly so, so that one scalar matrix
 stands for the three components. Its Cholesky factor is computed in full and then thinned: entries below `DROPPED` of
-their diagonals go. What is left has five entries a row, is positive definite by construction, and conditions the true
-matrix of a face to about 9 where its diagonal gives 470 (`tools/bench_sweeps.py` measures both).
+their diagonals go. What is left has about five entries a row, is positive definite by construction, and conditions the
+matrix nearly as well as the whole factor.
 """
 
 from __future__ import annotations
@@ -24,6 +24,12 @@ DROPPED = 0.03
 """Entries of the factor below this share of their diagonals (geometric mean) are left out."""
 SOFTEST = 1e-6
 """Added to the diagonal, as a share of its mean: a vertex that nothing holds has no stiffness."""
+NEAR = 1.0
+"""Contacts that may touch are those nearer at rest than this [mm]."""
+RIGID_SHARE = 0.2
+"""Share of the stiffness of contacts with bones and eyeballs that is counted on: most do not touch most of the time."""
+PAIR_SHARE = 0.06
+"""The same for lips and lids, which travel far together before they part."""
 
 
 def scalar_stiffness(load: Load) -> sparse.csr_matrix:
@@ -53,18 +59,19 @@ def scalar_stiffness(load: Load) -> sparse.csr_matrix:
     return sparse.csr_matrix((values, (rows, columns)), shape=(m, m))
 
 
-def contact_stiffness(load: Load, near: float) -> Floats:
-    """Return the stiffness of the contacts nearer than `near` [mm] at rest as if all touched, (m,) [mN/mm].
+def contact_stiffness(load: Load) -> Floats:
+    """Return a share of the stiffness of the contacts that may touch, (m,) [mN/mm].
 
     Left out, soft tissue pressed together over a wide patch would be many times stiffer than its preconditioner.
     """
     load.rest()
-    load.touch(load.x, near)
+    load.touch(load.x, NEAR)
     planes, total = load.moment.planes, np.zeros(len(load.patch.nodes))
     for c in range(int(planes.count[0])):
-        total[planes.node[c, 0]] += planes.stiffness[c]
+        k = planes.stiffness[c] * (PAIR_SHARE if planes.node[c, 1] >= 0 else RIGID_SHARE)
+        total[planes.node[c, 0]] += k
         if planes.node[c, 1] >= 0:
-            np.add.at(total, planes.node[c, 1:], planes.stiffness[c] * planes.weight[c])
+            np.add.at(total, planes.node[c, 1:], k * planes.weight[c])
     return total[: load.patch.m]
 
 

@@ -32,10 +32,6 @@ RESOLVED = 1.5
 """n sweeps resolve eigenvalues down to about (RESOLVED / n)^2 of the largest: measured, the least error."""
 SETTLED = 0.02
 """A step counts as converged when the last sweep wanted to move no vertex farther [mm]."""
-CONTACT_SHARE = 0.2
-"""Share of the stiffness of contacts that the preconditioner counts on: most do not touch most of the time."""
-CONTACT_NEAR = 1.0
-"""Contacts that may touch are those nearer at rest than this [mm]."""
 MOST_FACTORS = 4
 """Factors are kept for so many different time steps."""
 MOST_SUBSTEPS = 100_000
@@ -152,7 +148,7 @@ class ConjugateGradient(_Implicit):
         self.copies = load.patch.half.copies[:, 0].copy()
         self.work = (*(np.zeros((m, 3)) for _ in range(5)), np.zeros((m, 4)))
         self.stiffness = scalar_stiffness(load)
-        self.touching = CONTACT_SHARE * contact_stiffness(load, CONTACT_NEAR)
+        self.touching = contact_stiffness(load)
         self.order = elimination_order(self.stiffness, load.patch.scene.tethers.rest[:m])
         self.factors: dict[float, Factor] = {}
 
