@@ -40,7 +40,7 @@ class Options:
     scheme: str = "conjugate_gradient"
     integrator: str = "euler"
     iterations: int = 12
-    iteration_tolerance: float = 3e-3
+    iteration_tolerance: float = 6e-3
     symmetric: bool = True
     sweeps: int = 20
     adaptive: bool = False
