@@ -81,7 +81,7 @@ def head() -> Body:
 
 
 def smile(head: Body, left: float, right: float) -> Control:
-    """Return a control that pulls the mouth corners and opens the jaw a little."""
+    """Return a control that pulls the mouth corners, each by its own muscle."""
     case = Control.rest(head)
     names = head.muscles.names
     case.activation[names.index("zygomaticus_major_left")] = left
@@ -120,5 +120,5 @@ def test_a_crooked_smile_is_not_made_symmetric(head: Body) -> None:
 
 
 def test_a_lopsided_body_has_no_symmetry() -> None:
-    """A sheet with muscles on one side only is worked on as a whole."""
+    """A sheet with an eyeball behind one side only is worked on as a whole."""
     assert find_symmetry(held_sheet()) is None

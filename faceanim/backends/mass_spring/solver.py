@@ -305,7 +305,6 @@ class SolverMassSpring:
         if isinstance(state_out, StateMassSpring):
             state_out.pose_before = motion.pose
             state_out.pose = control.bone_pose.copy()
-        if isinstance(state_out, StateMassSpring):
             if state_out.q_before is None or state_out.qd_before is None:
                 state_out.q_before, state_out.qd_before = np.empty_like(state_in.q), np.empty_like(state_in.q)
             state_out.q_before[:] = state_in.q
