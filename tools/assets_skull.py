@@ -31,7 +31,8 @@ from faceanim.face.fit import (
 )
 from faceanim.face.skull import Skull, bone_grid
 from faceanim.geometry.distance import DistanceGrid
-from faceanim.geometry.distance_field import ray_hit, signed_distance_grid
+from faceanim.geometry.distance_field import signed_distance_grid
+from faceanim.geometry.rays import ray_hit
 from faceanim.geometry.surface import TriMesh
 
 MESHES = "models/meshes"

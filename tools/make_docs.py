@@ -17,9 +17,12 @@ from faceanim import Session, load_expression, load_face
 from faceanim.backends import backend_class
 from faceanim.bench.accuracy import apex_frame
 from faceanim.bench.faithfulness import Poser, artist_matches, movements
+from faceanim.bench.muscle_images import round_trips
 from faceanim.cli.drawing import Drawing, Picture
 from faceanim.cli.main import main as faceanim
 from faceanim.face.face import Face
+from faceanim.face.muscle_image import map_picture
+from faceanim.render.muscle_picture import muscle_image, muscle_views
 from faceanim.render.sequence import contact_sheet, write_png
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -85,6 +88,26 @@ def pictures(apex: Apex) -> None:
     write_png(DOCS / "inside.png", labelled(shown, list(kinds), 4))
 
 
+def muscle_images(face: Face) -> str:
+    """Write the muscle images of `assets/` and docs/muscle*.png; return a Markdown table of how well they are read."""
+    images = {}
+    for kind in ("front", "cylinder"):
+        images[kind], _ = muscle_image(face, face.muscle_table, kind)
+        write_png(ROOT / "assets" / f"muscle_image_{kind}.png", images[kind])
+    write_png(DOCS / "muscle_images.png", labelled(list(images.values()), ["front", "cylinder"], 2))
+    found = map_picture(images["front"], face)
+    views = muscle_views(face, found.table, 420)
+    write_png(DOCS / "muscles.png", np.concatenate([row[8:-36] for row in np.split(views, 2)]))
+    lines = [
+        "| picture | treatment | muscles and rings named right | faults | median [mm] | largest [mm] | seconds |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for r in round_trips(face):
+        numbers = f"{r.right} of {r.drawn} | {r.faults} | {r.median:.2f} | {r.max:.2f} | {r.seconds:.2f}"
+        lines.append(f"| {r.kind} | {r.treatment} | {numbers} |")
+    return "\n".join(lines) + "\n"
+
+
 def faithfulness(face: Face) -> str:
     """Return two Markdown tables: movements beside published ranges, and fields beside the artist's."""
     poser = Poser(face)
@@ -107,7 +130,7 @@ def insert_tables() -> None:
     """Put docs/framerate.md and docs/faithfulness.md between their marks in README.md."""
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    for name in ("framerate", "faithfulness"):
+    for name in ("framerate", "faithfulness", "muscles"):
         if not (DOCS / f"{name}.md").exists():
             continue
         table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
@@ -120,12 +143,14 @@ def insert_tables() -> None:
 def main() -> None:
     """Make everything, or what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("pictures", "framerate", "faithfulness", "insert"))
+    parser.add_argument("--only", choices=("pictures", "muscles", "framerate", "faithfulness", "insert"))
     only = parser.parse_args().only
     DOCS.mkdir(exist_ok=True)
     apex = Apex("default")
     if only in (None, "pictures"):
         pictures(apex)
+    if only in (None, "muscles"):
+        (DOCS / "muscles.md").write_text(muscle_images(apex.face), encoding="utf-8")
     if only in (None, "faithfulness"):
         (DOCS / "faithfulness.md").write_text(faithfulness(apex.face), encoding="utf-8")
     if only in (None, "framerate"):

@@ -5,16 +5,35 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from faceanim.ground.errors import UserError, unknown_name
+
+if TYPE_CHECKING:
+    from faceanim.face.face import Face
+
+
+def add_face(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Declare whose head it is."""
+    parser.add_argument("--face", default="default", help="name of the face (default: %(default)s)")
+    parser.add_argument("--density", default="default", help="coarse, default or fine")
+
+
+def face_asked(args: argparse.Namespace) -> Face:
+    """Return the face that the command line names, with muscles of one's own if it gives a list of them."""
+    from faceanim.face.library import load_face, read_muscles
+
+    face: Face = load_face(args.face, args.density)
+    source = getattr(args, "own_muscles", None)
+    return face if source is None else face.with_muscles(read_muscles(source), str(source))
 
 
 def add_simulation(parser: argparse.ArgumentParser) -> None:
     """Declare who is simulated and how."""
     group = parser.add_argument_group("simulation")
-    group.add_argument("--face", default="default", help="name of the face (default: %(default)s)")
-    group.add_argument("--density", default="default", help="coarse, default or fine")
+    add_face(group)
+    group.add_argument("--muscles", dest="own_muscles", metavar="FILE",
+                       help="muscles of one's own, as `faceanim muscles map` writes them")  # fmt: skip
     group.add_argument("--backend", default="mass_spring", help="how flesh answers (default: %(default)s)")
     group.add_argument(
         "--scheme", help="time stepping: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper"

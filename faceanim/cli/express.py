@@ -7,7 +7,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from faceanim.cli.choices import add_simulation, number, solver_options, use_threads, whole
+from faceanim.cli.choices import add_simulation, face_asked, number, solver_options, use_threads, whole
 from faceanim.ground.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -121,10 +121,8 @@ def session_asked(args: argparse.Namespace) -> Session:
     expression = expression_asked(args)
     timeline = timeline_asked(args, expression)
     options = solver_options(args)
-    from faceanim.face.library import load_face
-
     return limits.Session(
-        load_face(args.face, args.density),
+        face_asked(args),
         expression,
         timeline,
         fps=fps,

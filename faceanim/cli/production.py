@@ -161,6 +161,7 @@ class Production:
             "face": {
                 "name": session.face.name,
                 "density": session.face.density,
+                "muscles": session.face.muscle_source,
                 "vertices": len(apex),
                 "triangles": len(session.body.surface.triangles),
             },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,14 +13,13 @@ from faceanim.face import attach
 from faceanim.face.attach import LID, LIP, MUCOSA, NECK, SCALP, SKIN
 from faceanim.face.geodesic import distance_along
 from faceanim.face.library import asset_arrays, asset_folder, asset_text
-from faceanim.face.muscles import AnyMuscle, Lids, Terrain, build_muscles, parse_muscles
+from faceanim.face.muscles import BONES, AnyMuscle, Lids, Terrain, build_muscles, parse_muscles
 from faceanim.face.skull import JawMotion, Skull
 from faceanim.face.tissue import Tissue, parse_tissue
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Bools, Floats, Ints, floats, ints
 from faceanim.ground.errors import AssetError
 
-BONES = ("cranium", "jaw")
 EYES = ("left", "right")
 
 
@@ -49,7 +48,7 @@ class Face:
 
     mesh : the simulated skin (n vertices);  region : (n,) codes of `attach`;  mirror : (n,) twin vertices
     depth, depth_cranium, depth_jaw : (n,) [mm] to bone;  landmarks : name -> vertex
-    contact_sets : the vertex lists of lips and lids that can touch
+    contact_sets : the vertex lists of lips and lids that can touch;  muscle_source : where the muscles come from
     """
 
     name: str
@@ -67,6 +66,7 @@ class Face:
     jaw: JawMotion
     tissue: Tissue
     muscle_table: dict[str, AnyMuscle]
+    muscle_source: str = "built-in"
     parts: tuple[Part, ...] = ()
     uv: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     uv_triangles: Ints = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int32))
@@ -105,6 +105,10 @@ class Face:
             )
         except KeyError as error:
             raise AssetError(f"asset {asset_folder() / file} lacks the array {error}; reinstall faceanim") from error
+
+    def with_muscles(self, table: dict[str, AnyMuscle], source: str) -> Face:
+        """Return this head with other muscles; `source` says where they come from."""
+        return replace(self, muscle_table=table, muscle_source=source)
 
     @cached_property
     def texture(self) -> np.ndarray:

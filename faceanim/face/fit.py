@@ -12,14 +12,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from faceanim.face.muscles import BONES
 from faceanim.face.skull import Skull, bone_grid, rotation
 from faceanim.geometry.distance import DistanceGrid
-from faceanim.geometry.distance_field import point_distance, ray_hit, signed_distance_grid
+from faceanim.geometry.distance_field import point_distance, signed_distance_grid
+from faceanim.geometry.rays import ray_hit
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Floats, Ints, floats
 from faceanim.ground.errors import AssetError, UserError
 
-BONES = ("cranium", "jaw")
 MUCOSA, LID = 2, 3
 _FEWEST_MARKS = 8
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from faceanim.ground.errors import AssetError, unknown_name
 
+if TYPE_CHECKING:
+    from faceanim.face.muscles import AnyMuscle
+
 DENSITIES = ("coarse", "default", "fine")
 FACES = ("default",)
 _LARGEST_ASSET = 64 * 2**20
+_LARGEST_LIST = 2**20
 
 
 def asset_folder() -> Path:
@@ -47,6 +51,25 @@ def asset_arrays(name: str) -> dict[str, np.ndarray]:
         raise
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
         raise AssetError(f"asset {path} is missing or broken ({error}); reinstall faceanim") from error
+
+
+def read_muscles(path: str | Path) -> dict[str, AnyMuscle]:
+    """Return the muscles of a TOML file of one's own; raise `AssetError` naming the file and what is wrong with it."""
+    from faceanim.face.muscles import parse_muscles
+
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(_LARGEST_LIST + 1)
+        if len(data) > _LARGEST_LIST:
+            raise AssetError(f"{path} is larger than {_LARGEST_LIST >> 20} MB; a list of muscles has some kB")
+        table = parse_muscles(data.decode("utf-8"), str(path))
+    except OSError as error:
+        raise AssetError(f"{path} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError:
+        raise AssetError(f"{path} is not a text file in UTF-8; a list of muscles is TOML") from None
+    if not table:
+        raise AssetError(f"{path} holds no muscles; `faceanim muscles map` writes such a file")
+    return table
 
 
 def faces() -> tuple[str, ...]:

@@ -8,8 +8,10 @@ earlier paper for the zones).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,6 +21,7 @@ from faceanim.ground.arrays import Floats, Ints
 from faceanim.ground.errors import AssetError
 
 Vec = tuple[float, float, float]
+BONES = ("cranium", "jaw")
 Side = Literal["any", "upper", "lower"]
 
 
@@ -132,6 +135,30 @@ class _Zone:
     bone: int
 
 
+_SIDES = ("left", "right")
+_LENGTHS = ("radius", "half_width", "length", "reach", "softening", "width", "force")
+_LARGEST = 1e6
+
+
+def _fault(muscle: AnyMuscle, bones: Collection[str]) -> str | None:
+    """Return what is wrong with a row, None if it can be built."""
+    for name in muscle.__struct_fields__:
+        value = getattr(muscle, name)
+        numbers = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(v, float) and not abs(v) < _LARGEST for v in numbers):
+            return f"has {name} {value}; it must be finite and below {_LARGEST:g}"
+        if name in _LENGTHS and not value > 0:
+            return f"has {name} {value}; it must be positive"
+    if isinstance(muscle, SphincterMuscle) and not min(muscle.axes) > 0:
+        return f"has axes {muscle.axes}; both must be positive"
+    if isinstance(muscle, (LinearMuscle, SheetMuscle)):
+        if muscle.bone not in bones:
+            return f"springs from {muscle.bone!r}; a bone is one of {', '.join(bones)}"
+        if muscle.insertion in (muscle.origin, muscle.via) or muscle.origin == muscle.via:
+            return "has two points in one place; origin, via and insertion must differ"
+    return None
+
+
 def parse_muscles(text: str, source: str) -> dict[str, AnyMuscle]:
     """Return the muscles of a TOML text by base name; raise `AssetError` naming what does not fit."""
     try:
@@ -139,9 +166,21 @@ def parse_muscles(text: str, source: str) -> dict[str, AnyMuscle]:
     except msgspec.DecodeError as error:
         raise AssetError(f"{source}: {error}") from error
     for name, muscle in table.items():
-        if not muscle.force > 0:
-            raise AssetError(f"{source}: muscle {name!r} has force {muscle.force}; it must be positive [mN]")
+        fault = _fault(muscle, BONES)
+        if fault is not None:
+            raise AssetError(f"{source}: muscle {name!r} {fault}")
+        if not name.replace("_", "").isalnum() or not name.isascii():
+            raise AssetError(f"{source}: {name!r} is no name for a muscle; use letters, digits and underscores")
+        twin = name.rpartition("_")[0] if side_of(name) != "middle" else ""
+        if twin in table and table[twin].paired:
+            raise AssetError(f"{source}: muscle {name!r} is given twice: the paired {twin!r} has that side too")
     return table
+
+
+def side_of(name: str) -> str:
+    """Return the side in a full name: "left", "right" or "middle"."""
+    end = name.rpartition("_")[2]
+    return end if end in _SIDES else "middle"
 
 
 def mirrored(muscle: AnyMuscle) -> AnyMuscle:
@@ -150,7 +189,7 @@ def mirrored(muscle: AnyMuscle) -> AnyMuscle:
     return msgspec.structs.replace(muscle, **flipped)
 
 
-def both_sides(table: dict[str, AnyMuscle]) -> dict[str, tuple[AnyMuscle, str]]:
+def both_sides(table: Mapping[str, AnyMuscle]) -> dict[str, tuple[AnyMuscle, str]]:
     """Return every single muscle by full name (name_left, name_right, or the name if unpaired) with its side."""
     out: dict[str, tuple[AnyMuscle, str]] = {}
     for name, muscle in table.items():
@@ -158,8 +197,98 @@ def both_sides(table: dict[str, AnyMuscle]) -> dict[str, tuple[AnyMuscle, str]]:
             out[f"{name}_left"] = (muscle, "left")
             out[f"{name}_right"] = (mirrored(muscle), "right")
         else:
-            out[name] = (muscle, "middle")
+            out[name] = (muscle, side_of(name))
     return out
+
+
+def one_sided(table: Mapping[str, AnyMuscle]) -> dict[str, AnyMuscle]:
+    """Return every muscle by its full name, each a row of its own (paired = false)."""
+    return {n: msgspec.structs.replace(m, paired=False) for n, (m, _) in both_sides(table).items()}
+
+
+def paired(table: Mapping[str, AnyMuscle], within: float = 0.0) -> dict[str, AnyMuscle]:
+    """Return `table` with twins that mirror each other to `within` [mm] written once, as their mean.
+
+    Muscles in the middle that are their own mirror image to `within` are put on x = 0.
+    """
+    rows, out = one_sided(table), dict[str, AnyMuscle]()
+    for name, row in rows.items():
+        base, side = name.rpartition("_")[0], side_of(name)
+        if side == "middle":
+            half = _mean(row, mirrored(row), within)
+            out[name] = row if half is None else half
+            continue
+        left, right = rows.get(f"{base}_left"), rows.get(f"{base}_right")
+        mean = None if left is None or right is None else _mean(left, mirrored(right), within)
+        if mean is None or base in rows:
+            out[name] = row
+        else:
+            out[base] = msgspec.structs.replace(mean, paired=True)
+    return out
+
+
+_POINTS = ("origin", "via", "insertion", "centre")
+
+
+def _mean(a: AnyMuscle, b: AnyMuscle, within: float) -> AnyMuscle | None:
+    """Return the row half-way between `a` and `b`, None if they differ by more than their points within `within`."""
+    if type(a) is not type(b):
+        return None
+    changed: dict[str, tuple[float, ...]] = {}
+    for name in (*_POINTS, "axes"):
+        p, q = getattr(a, name, None), getattr(b, name, None)
+        if p is not None and q is not None and p != q:
+            if math.dist(p, q) > within:
+                return None
+            changed[name] = tuple(round(0.5 * (u + v), 4) + 0.0 for u, v in zip(p, q, strict=True))
+    a = msgspec.structs.replace(a, **changed)
+    return a if a == msgspec.structs.replace(b, **changed) else None
+
+
+def moved(muscle: AnyMuscle, linear: Floats, offset: Floats, scale: float) -> AnyMuscle:
+    """Return a muscle carried to another head: points by x -> linear x + offset, lengths by `scale`, forces by scale^2."""
+    if scale == 1.0 and np.array_equal(linear, np.eye(3)) and not offset.any():
+        return muscle
+    changed: dict[str, Any] = {}
+    for name in muscle.__struct_fields__:
+        value = getattr(muscle, name)
+        if value is None:
+            continue
+        if name in _POINTS:
+            changed[name] = tuple(float(v) for v in linear @ np.array(value) + offset)
+        elif name == "axes":
+            changed[name] = (float(abs(linear[0, 0]) * value[0]), float(abs(linear[1, 1]) * value[1]))
+        elif name in ("radius", "half_width", "length", "reach", "softening", "protrusion"):
+            changed[name] = value * scale
+        elif name == "force":
+            changed[name] = value * scale**2
+    return msgspec.structs.replace(muscle, **changed)
+
+
+def muscles_text(table: Mapping[str, AnyMuscle], notes: Mapping[str, str] | None = None, head: str = "") -> str:
+    """Return TOML that `parse_muscles` reads back as an equal table.
+
+    notes : a comment for some of the muscles;  head : a comment at the top;  fields at their defaults are left out
+    """
+    lines = [f"# {line}" for line in head.splitlines()]
+    for name, muscle in table.items():
+        note = (notes or {}).get(name, "")
+        lines += ["", f"[{name}]", *(f"# {line}" for line in note.splitlines())]
+        lines.append(f'kind = "{muscle.__struct_config__.tag}"')
+        for field in msgspec.structs.fields(muscle):
+            value = getattr(muscle, field.name)
+            if value is None or (field.default is not msgspec.NODEFAULT and value == field.default):
+                continue
+            lines.append(f"{field.name} = {_toml(value)}")
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, tuple):
+        return "[" + ", ".join(repr(float(v)) for v in value) + "]"
+    return f'"{value}"' if isinstance(value, str) else repr(float(value))
 
 
 def _bump(r: Floats) -> Floats:
@@ -277,7 +406,7 @@ def _zones(name: str, muscle: AnyMuscle, side: str, terrain: Terrain) -> list[_Z
     return _lid(name, muscle, terrain, side)
 
 
-def build_muscles(table: dict[str, AnyMuscle], terrain: Terrain) -> Muscles:
+def build_muscles(table: Mapping[str, AnyMuscle], terrain: Terrain) -> Muscles:
     """Return the fibres of every muscle of `table` on `terrain`; raise `AssetError` naming a muscle that misses it."""
     named = both_sides(table)
     rows = [(k, z) for k, (name, (m, side)) in enumerate(named.items()) for z in _zones(name, m, side, terrain)]

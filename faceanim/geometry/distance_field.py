@@ -1,4 +1,4 @@
-"""Distances to a triangle mesh: of points, along rays, and signed on a grid."""
+"""Distances to a triangle mesh: of points, and signed on a grid."""
 
 from __future__ import annotations
 
@@ -31,30 +31,6 @@ def point_distance(points: Floats, mesh: TriMesh) -> tuple[Floats, Ints]:
     distance, triangle = np.empty(len(points)), np.empty(len(points), dtype=np.int32)
     kernels.nearest_triangle(points, corners, centres, radii, bound, distance, triangle)
     return distance, triangle
-
-
-def ray_hit(start: Floats, direction: Floats, mesh: TriMesh, reach: float) -> Floats:
-    """Return how far each ray runs to its first hit, (n,) [mm]; inf where it misses `mesh` within `reach` [mm].
-
-    start, direction : (n, 3), direction of unit length
-    """
-    a = mesh.points[mesh.triangles[:, 0]]
-    u = mesh.points[mesh.triangles[:, 1]] - a
-    v = mesh.points[mesh.triangles[:, 2]] - a
-    out = np.full(len(start), np.inf)
-    for i, (p, d) in enumerate(zip(start, direction, strict=True)):
-        h = np.cross(d, v)
-        det = np.einsum("tk,tk->t", u, h)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            w = p - a
-            s = np.einsum("tk,tk->t", w, h) / det
-            q = np.cross(w, u)
-            r = q @ d / det
-            far = np.einsum("tk,tk->t", v, q) / det
-            hit = (s >= 0) & (r >= 0) & (s + r <= 1) & (far >= 0) & (far <= reach)
-        if hit.any():
-            out[i] = far[hit].min()
-    return out
 
 
 def _winding(corners: Floats, origin: Floats, spacing: float, shape: tuple[int, ...]) -> np.ndarray:

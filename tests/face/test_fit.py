@@ -21,7 +21,8 @@ from faceanim.face.fit import (
 )
 from faceanim.face.library import asset_arrays, asset_text
 from faceanim.face.skull import Skull
-from faceanim.geometry.distance_field import point_distance, ray_hit, signed_distance_grid
+from faceanim.geometry.distance_field import point_distance, signed_distance_grid
+from faceanim.geometry.rays import ray_hit
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.errors import AssetError, UserError
 
