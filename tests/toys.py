@@ -87,6 +87,7 @@ def toy_face() -> Any:
     return SimpleNamespace(
         name="toy",
         density="coarse",
+        muscle_source="built-in",
         mesh=body.surface,
         muscle_names=MUSCLES,
         jaw=ToyJaw(),
