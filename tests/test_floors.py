@@ -29,8 +29,8 @@ FLOORS = {
     "studio": 7,
     "__main__": 8,
 }
-NEIGHBOURS = {("expression", "face")}
-"""Rooms of one floor that may be seen from another: face, then expression."""
+NEIGHBOURS = {("expression", "face"), ("cli", "studio")}
+"""Rooms of one floor that may be seen from another: face, then expression; the command line opens the studio."""
 
 
 def _modules() -> dict[str, Path]:

@@ -26,7 +26,7 @@ SMALLEST_RADIUS = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Discs:
-    """centre : red, green, blue, each (n, 2) [pixel]   radius : usual radius [pixel]   wrong : (n, 2) of other colours."""
+    """centre : red, green, blue, each (n, 2) [pixel]   radius : usual one [pixel]   wrong : (n, 2) of other colours."""
 
     centre: tuple[Floats, Floats, Floats]
     radius: float
@@ -67,7 +67,7 @@ def find_discs(picture: np.ndarray) -> Discs:
     for k in range(3):
         usual = _usual_radius([blobs[k][0].thin]) if len(blobs[k][0].thin) >= 3 else radius
         others = cv2.max(lead[(k + 1) % 3], lead[(k + 2) % 3])
-        centre.append(_fit_colour(lead[k], others, bands, *blobs[k], usual))
+        centre.append(_fit_colour(lead[k], others, picture, *blobs[k], usual))
     if radius == 0.0:
         return Discs((none, none, none), 0.0, _wrong(strong, picture, none, level, 0.0))
     return Discs((centre[0], centre[1], centre[2]), radius, _wrong(strong, picture, np.vstack(centre), level, radius))
@@ -76,6 +76,10 @@ def find_discs(picture: np.ndarray) -> Discs:
 def _lead(bands: list[np.ndarray], k: int) -> np.ndarray:
     """Return by how much channel k exceeds the greater of the others, int16."""
     return cv2.subtract(bands[k], cv2.max(bands[(k + 1) % 3], bands[(k + 2) % 3]), dtype=cv2.CV_16S)
+
+
+def _lead_of(colour: Floats, k: int) -> float:
+    return float(colour[k] - np.delete(colour, k).max())
 
 
 def _hue(colour: Floats) -> tuple[float, float]:
@@ -156,15 +160,21 @@ def _usual_radius(thin: list[Floats]) -> float:
 
 
 def _fit_colour(
-    lead: np.ndarray, others: np.ndarray, bands: list[np.ndarray], blobs: _Blobs, marks: list[int], amount: float,
+    lead: np.ndarray,
+    others: np.ndarray,
+    picture: np.ndarray,
+    blobs: _Blobs,
+    marks: list[int],
+    amount: float,
     usual: float,
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Return the centres (n, 2) of the discs of one colour; usual : their radius [pixel], about."""
-    if usual == 0.0:
-        return np.zeros((0, 2))
     least = max(4.0, 0.2 * np.pi * usual**2)
     marks = [k for k in marks if least <= blobs.stats[k, 4] <= 14 * np.pi * usual**2]
-    patches = [_patch(lead, others, bands, blobs, k, amount, usual) for k in marks]
+    if usual == 0.0 or not marks:
+        return np.zeros((0, 2))
+    paint = _paint(lead, picture, blobs, marks, amount)
+    patches = [_patch(lead, others, picture, blobs, k, paint) for k in marks]
     singles = [p for p in patches if p.cover.sum() < 1.25 * np.pi * usual**2]
     fits = [_fit(p, _middle(p), usual, 0.5, free=2) for p in singles[:24]]
     good = [f for f in fits if f[3] < 0.12 and 0.6 * usual < f[1] < 1.6 * usual]
@@ -175,27 +185,43 @@ def _fit_colour(
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
-def _patch(
-    lead: np.ndarray, others: np.ndarray, bands: list[np.ndarray], blobs: _Blobs, k: int, amount: float, usual: float
-) -> _Patch:
-    """Return coverage and weight of the pixels in and around blob k."""
-    reach = 3 + int(0.3 * usual)
+def _patch(lead: np.ndarray, others: np.ndarray, picture: np.ndarray, blobs: _Blobs, k: int, paint: Floats) -> _Patch:
+    """Return coverage by `paint` (3,) RGB and weight of the pixels in and around blob k."""
+    reach = 3 + int(0.3 * blobs.thin.max(initial=0.0))
     x, y, w, h = blobs.stats[k, :4]
     x0, y0 = max(x - reach, 0), max(y - reach, 0)
     box = np.s_[y0 : y + h + reach, x0 : x + w + reach]
-    label, value = blobs.label[box], lead[box] / amount
-    square = np.ones((3, 3), np.uint8)
-    covered = cv2.dilate((others[box] > 0.25 * amount).view(np.uint8), square) > 0
-    bright = cv2.min(cv2.min(bands[0][box], bands[1][box]), bands[2][box])
+    label, colour = blobs.label[box], picture[box].astype(float)
+    covered = (
+        cv2.dilate((others[box] > 0.4 * _lead_of(paint, int(paint.argmax()))).view(np.uint8), np.ones((3, 3), np.uint8))
+        > 0
+    )
     around = (label == 0) & ~covered
-    ground = float(np.median(value[around])) if around.any() else 0.0
-    white = bright > (float(np.median(bright[around])) if around.any() else 255.0) + 45.0
-    # White lines lead in no colour: beside them the ground is 0, and what is half white is trusted less.
-    beside = (cv2.dilate(white.view(np.uint8), square) > 0) & (value < 0.9)
-    cover = np.where(beside, value, (value - ground) / (1.0 - min(ground, 0.5)))
+    if around.any():
+        bright = colour.min(axis=2)
+        around &= bright < np.median(bright[around]) + 45.0
+    ground = np.median(colour[around], axis=0) if around.any() else np.full(3, 110.0)
+    # A pixel is ground + paint + the white of a line. The lead of paint is blind to light and shade, so the share of
+    # paint is read from that, less the lead of the ground where no line covers it.
+    shares = np.linalg.lstsq(np.stack([paint - ground, 255.0 - ground], axis=1), (colour - ground).reshape(-1, 3).T)[0]
+    line = np.clip(shares[1].reshape(label.shape), 0.0, 1.0)
+    full = _lead_of(paint, int(paint.argmax()))
+    tint = float(np.clip(_lead_of(ground, int(paint.argmax())) / full, -0.5, 0.5))
+    cover = np.clip((lead[box] / full - (1.0 - line) * tint) / (1.0 - tint), -0.3, 1.15)
     yy, xx = np.nonzero(((label == k) | (label == 0)) & ~covered)
-    weight = np.where(label == k, 1.0, 0.7) * np.where(beside & ~white, 0.4, 1.0)
-    return _Patch(xx + x0 + 0.5, yy + y0 + 0.5, np.clip(cover, -0.3, 1.1)[yy, xx], weight[yy, xx])
+    return _Patch(xx + x0 + 0.5, yy + y0 + 0.5, cover[yy, xx], np.where(label == k, 1.0, 0.7)[yy, xx])
+
+
+def _paint(lead: np.ndarray, picture: np.ndarray, blobs: _Blobs, marks: list[int], amount: float) -> Floats:
+    """Return the usual RGB colour (3,) of marks where they are not mixed with what surrounds them."""
+    full = []
+    for k in marks[:64]:
+        x, y, w, h = blobs.stats[k, :4]
+        box = np.s_[y : y + h, x : x + w]
+        value = np.where(blobs.label[box] == k, lead[box], -999)
+        inside = value >= min(0.96 * float(value.max()), 0.96 * amount)
+        full.append(np.median(picture[box][inside].astype(float), axis=0))
+    return np.median(full, axis=0)
 
 
 def _middle(patch: _Patch) -> Floats:
@@ -205,7 +231,7 @@ def _middle(patch: _Patch) -> Floats:
 
 
 def _cover(patch: _Patch, centre: Floats, radius: float, soft: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return coverage (n,), free share (k, n) left by the other discs, edge density (k, n), distance vectors (k, n, 2)."""
+    """Return coverage (n,), share left by other discs (k, n), edge density (k, n), vectors from centres (k, n, 2)."""
     away = np.stack([patch.x - centre[:, :1], patch.y - centre[:, 1:]], axis=2)
     deep = (radius - np.hypot(away[:, :, 0], away[:, :, 1])) / soft
     clear = np.maximum(1.0 - ndtr(deep), 1e-9)
@@ -269,7 +295,7 @@ def _discs_of(patch: _Patch, radius: float, soft: float, noise: float) -> Floats
                 (_fit(patch, start, radius, soft) for start in _starts(patch, best[0], radius, soft)), key=_misfit
             )
             apart = _least_distance(more[0]) > 0.6 * radius
-            if not apart or more[3] > 0.85 * best[3]:
+            if not apart or _astray(patch, more[0]) > 0.8 * radius or more[3] > 0.85 * best[3]:
                 break
             best = more
             if best[3] < noise:
@@ -283,6 +309,12 @@ def _misfit(fit: tuple[Floats, float, float, float]) -> float:
     return fit[3]
 
 
+def _astray(patch: _Patch, centre: Floats) -> float:
+    """Return how far the remotest centre is from the blob's own pixels [pixel]."""
+    own = np.stack([patch.x, patch.y], axis=1)[patch.weight == 1.0]
+    return float(np.hypot(*(centre[:, None] - own[None]).T).min(axis=0).max()) if len(own) else 0.0
+
+
 def _least_distance(points: Floats) -> float:
     apart = np.hypot(*(points[:, None] - points[None]).T)
     return float((apart + 1e9 * np.eye(len(points))).min())
@@ -290,7 +322,7 @@ def _least_distance(points: Floats) -> float:
 
 def _starts(patch: _Patch, centre: Floats, radius: float, soft: float) -> list[Floats]:
     """Return guesses (k + 1, 2) with one disc more: one added where most is missing, or each one split."""
-    missing = patch.cover - _cover(patch, centre, radius, soft)[0]
+    missing = (patch.cover - _cover(patch, centre, radius, soft)[0]) * (patch.weight == 1.0)
     place = np.stack([patch.x, patch.y], axis=1)
     worst = place[np.argmax(missing)]
     gone = np.maximum(missing, 0.0)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.ndimage import map_coordinates
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_matrix, csr_matrix, hstack, identity, vstack
 
@@ -23,12 +22,12 @@ MOST_BEND = 0.13
 """Greatest sagitta of a line, in its length."""
 BRIDGE, MIXED = 0, 1
 """Candidates between an attachment and an insertion, and between two marks of one kind."""
-UNEXPLAINED = 0.13
+UNEXPLAINED = 0.18
 ALONE = 2.0
 """Costs of leaving white unexplained [per pixel's length] and a mark without line; a line costs 1."""
 GLARE, MOST_GLARE = 212, 0.5
 """Ground on which no white line shows, 0..255, and the share of it that a line may cross."""
-LEAST_LENGTH, LEAST_STRAY = 9.0, 16.0
+LEAST_LENGTH, LEAST_STRAY = 9.0, 28.0
 """Shortest loose line that is believed, with one mark and with none [pixel at a side of 512]."""
 
 
@@ -45,13 +44,17 @@ class Lines:
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """What is seen of lines: white (h, w) 0..1, hidden (h, w) under marks, glare (h, w) as white as lines by itself, and
-    the usual peak and width of a line [pixel]; unit : pixels for one pixel of a picture 512 wide.
+    """What is seen of lines.
+
+    white : (h, w) 0..1   hidden : (h, w) 1 under marks and on glare   glare : (h, w) 1 where the ground is too bright
+    for a line to show   light : (h, w) 1 where it nearly is   peak, width : usual white and width [pixel] of a line
+    unit : pixels to one pixel of a picture 512 wide
     """
 
     white: np.ndarray
     hidden: np.ndarray
     glare: np.ndarray
+    light: np.ndarray
     peak: float
     width: float
     unit: float
@@ -78,10 +81,13 @@ def find_lines(picture: np.ndarray, marks: Floats, kind: Ints, radius: float, bl
     sight = _sight(bright, marks * ratio, np.vstack([marks, blind]) * ratio, radius * ratio)
     place = marks * ratio
     paths = _straight(sight, place, kind, radius * ratio)
-    chosen, left = _choose(sight, paths, len(marks), place)
+    chosen, left = _choose(sight, paths, len(marks))
+    for k in chosen:
+        if kind[paths.pair[k, 0]] == kind[paths.pair[k, 1]]:
+            _stroke(left, paths.course[k], sight.width, 1.0)
     if left.sum() > 6.0 * sight.unit * sight.width and len(marks) > 1:
         paths = _joined(paths, _bent(sight, place, kind, radius * ratio, left))
-        chosen, left = _choose(sight, paths, len(marks), place)
+        chosen, left = _choose(sight, paths, len(marks))
     loose, touched = _loose_ends(sight, left, place, radius * ratio)
     return Lines(paths.pair[chosen], loose / ratio, touched)
 
@@ -95,6 +101,7 @@ def _sight(bright: np.ndarray, marks: Floats, discs: Floats, radius: float) -> _
     filled = np.where(hidden, cv2.medianBlur(bright, min(4 * wide + 1, 101)), bright)
     ground = cv2.morphologyEx(filled, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide, wide)))
     glare = cv2.dilate((ground > GLARE).view(np.uint8), np.ones((wide, wide), np.uint8)) > 0
+    light = (ground > 0.87 * GLARE).astype(np.float32)
     ground = ground.astype(np.float32)
     white = np.clip((filled - ground) / np.maximum(255.0 - ground, 45.0), 0.0, 1.0).astype(np.float32)
     white[hidden | glare] = 0.0
@@ -108,7 +115,7 @@ def _sight(bright: np.ndarray, marks: Floats, discs: Floats, radius: float) -> _
     # Many marks have several lines; those with one tell its width.
     width = float(np.percentile((share * (share > 0.15)).sum(axis=1), 20)) * arc if len(share) else 0.6 * radius
     hidden = (hidden | glare).astype(np.float32)
-    return _Sight(white, hidden, glare.astype(np.float32), peak, float(np.clip(width, 1.0, 1.2 * radius)), unit)
+    return _Sight(white, hidden, glare.astype(np.float32), light, peak, float(np.clip(width, 1.0, 1.2 * radius)), unit)
 
 
 def _under(discs: Floats, radius: float, shape: tuple[int, ...]) -> np.ndarray:
@@ -124,9 +131,16 @@ def _ring(middle: Floats, radius: float) -> Floats:
 
 
 def _read(image: np.ndarray, at: Floats) -> Floats:
-    """Return `image` at points (..., 2) [pixel], linearly between pixel centres."""
-    out = map_coordinates(image, [at[..., 1] - 0.5, at[..., 0] - 0.5], order=1, mode="constant", output=np.float64)
-    return out
+    """Return `image` (h, w) float32 at points (..., 2) [pixel], linearly between pixel centres; 0 outside."""
+    place = (at - 0.5).astype(np.float32)
+    rows = place.reshape(-1, place.shape[-2], 2)
+    out = np.empty(rows.shape[:2])
+    for first in range(0, len(rows), 16384):
+        part = rows[first : first + 16384]
+        out[first : first + 16384] = cv2.remap(
+            image, part[:, :, 0], part[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
+    return out.reshape(place.shape[:-1])
 
 
 def _pairs(place: Floats, kind: Ints) -> tuple[Ints, Ints]:
@@ -184,14 +198,14 @@ def _straight(sight: _Sight, place: Floats, kind: Ints, radius: float) -> _Paths
             if visible[g] < 2.5 * sight.unit:
                 if not mixed[k] and length[k] < 2.0 * radius + 6.0 * sight.unit:
                     keep.append((pair[k], 2.8, courses[g]))
-            elif worst[g] > 0.5 and mean[g] > 0.75:
+            elif worst[g] > (0.55 if mixed[k] else 0.5) and mean[g] > (0.85 if mixed[k] else 0.8):
                 # Deduct from a line what its whiteness leaves to be desired; a line of one kind is the last resort.
                 keep.append((pair[k], _cost(mean[g], worst[g], 0.0, mixed[k]), courses[g]))
     return _paths(keep)
 
 
 def _cost(mean: float, worst: float, bend: float, mixed: int) -> float:
-    return 1.0 + 4.0 * (1.0 - mean) + 1.5 * (1.0 - worst) + 3.0 * abs(bend) + 1.2 * mixed
+    return 1.0 + 9.0 * (1.0 - mean) + 2.5 * (1.0 - worst) + 2.0 * abs(bend) + 1.2 * mixed
 
 
 def _paths(keep: list[tuple[Ints, float, Floats]]) -> _Paths:
@@ -210,34 +224,37 @@ def _bent(sight: _Sight, place: Floats, kind: Ints, radius: float, left: np.ndar
     sure = wanted[pair].any(axis=1)
     pair, mixed = pair[sure], mixed[sure]
     length = np.hypot(*(place[pair[:, 1]] - place[pair[:, 0]]).T)
+    # What may be white at best: its greatest within a pixel, and all under marks.
+    hopeful = np.maximum(cv2.dilate(np.minimum(sight.white / sight.peak, 1.0), np.ones((3, 3), np.uint8)), sight.hidden)
     keep: list[tuple[Ints, float, Floats]] = []
     for k in np.flatnonzero((length > 2.0 * radius + 4.0) & (length < 330.0 * sight.unit)):
         start, end = place[pair[k, 0]], place[pair[k, 1]]
-        steps = max(int(np.ceil(MOST_BEND * length[k] / (0.35 * sight.width))), 1)
+        steps = max(int(np.ceil(MOST_BEND * length[k] / (0.6 * sight.width))), 1)
         bends = np.linspace(-MOST_BEND, MOST_BEND, 2 * steps + 1)
-        rough = _course(start, end, bends, max(int(length[k] / (1.5 * sight.unit)), 8))
-        mean, worst, _ = _support(sight, rough)
-        good = (mean > 0.5) & (worst > 0.2) & (_read(sight.glare, rough).mean(axis=1) < MOST_GLARE)
-        if not good.any():
+        level = _read(hopeful, _course(start, end, bends, max(int(length[k] / (2.0 * sight.unit)), 8)))
+        hope = np.where((level.mean(axis=1) > 0.65) & ((level < 0.3).mean(axis=1) < 0.12), level.mean(axis=1), 0.0)
+        if not hope.any():
             continue
-        best = int(np.argmax(np.where(good, mean, 0.0)))
-        bend, mean_, worst_, course = _settled(sight, start, end, bends[best], bends[1] - bends[0])
-        if mean_ > 0.72 and worst_ > 0.45:
-            keep.append((pair[k], _cost(mean_, worst_, bend, mixed[k]), course))
+        likely = bends[hope > hope.max() - 0.06]
+        bend, mean, worst, course = _settled(sight, start, end, likely.min(), likely.max(), bends[1] - bends[0])
+        good = mean > 0.85 and worst > 0.55 if mixed[k] else mean > 0.75 and worst > 0.45
+        if good and _read(sight.glare, course).mean() < MOST_GLARE:
+            keep.append((pair[k], _cost(mean, worst, bend, mixed[k]), course))
     return _paths(keep)
 
 
-def _settled(sight: _Sight, start: Floats, end: Floats, bend: float, step: float) -> tuple[float, float, float, Floats]:
-    """Return the bend that fits best near `bend`, its mean and worst white, and its course."""
-    count = int(np.ceil(np.hypot(*(end - start)))) + 1
-    bends = bend + step * np.linspace(-1.0, 1.0, 9)
-    courses = _course(start, end, bends, count)
+def _settled(
+    sight: _Sight, start: Floats, end: Floats, least: float, most: float, step: float
+) -> tuple[float, float, float, Floats]:
+    """Return the bend that fits best between two, its mean and worst white, and its course."""
+    bends = np.arange(least - step, most + 1.01 * step, 0.25 * step)
+    courses = _course(start, end, bends, int(np.ceil(np.hypot(*(end - start)))) + 1)
     mean, worst, _ = _support(sight, courses)
     best = int(np.argmax(mean + 0.5 * worst))
     return float(bends[best]), float(mean[best]), float(worst[best]), courses[best]
 
 
-def _choose(sight: _Sight, paths: _Paths, marks: int, place: Floats) -> tuple[Ints, np.ndarray]:
+def _choose(sight: _Sight, paths: _Paths, marks: int) -> tuple[Ints, np.ndarray]:
     """Return the numbers of the paths that explain the white at least cost, and the white (h, w) that stays."""
     core = (sight.white > 0.5 * sight.peak).astype(np.float32)
     if not len(paths.cost):
@@ -300,6 +317,8 @@ def _explained(sight: _Sight, paths: _Paths, core: np.ndarray) -> tuple[csr_matr
 def _loose_ends(sight: _Sight, left: np.ndarray, place: Floats, radius: float) -> tuple[Floats, Bools]:
     """Return the loose ends (n, 2) of lines in the white that is `left`, and which marks (m,) they start from."""
     touched = np.zeros(len(place), bool)
+    # The white of an eye is a line where lid and iris leave little of it.
+    light = cv2.dilate(sight.light, np.ones((2 * round(8.0 * sight.unit) + 1,) * 2, np.uint8))
     ends = []
     for tips in _pieces(sight, left):
         length = float(np.hypot(*(tips[1] - tips[0])))
@@ -308,6 +327,9 @@ def _loose_ends(sight: _Sight, left: np.ndarray, place: Floats, radius: float) -
         if length < (LEAST_LENGTH if known else LEAST_STRAY) * sight.unit or not _is_line(sight, *tips):
             continue
         if len(known) == 2 and known[0] != known[1]:
+            continue
+        doubtful = not known or length < LEAST_STRAY * sight.unit
+        if doubtful and _read(light, _course(tips[0], tips[1], 0.0, 12)).mean() > 0.3:
             continue
         touched[known] = True
         far = 1 if at[0] >= 0 else 0 if at[1] >= 0 else int(_gap(place, tips[1]) > _gap(place, tips[0]))

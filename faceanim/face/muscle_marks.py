@@ -104,7 +104,7 @@ def _lonely(lines: Lines, ends: Floats, kind: Ints) -> list[MarkFault]:
 
 def _disc_faults(wrong: Floats) -> list[MarkFault]:
     text = (
-        "the colour of this mark means nothing; paint it pure red (255, 0, 0) for an insertion, green (0, 255, 0) for an "
-        "attachment or blue (0, 0, 255) for the end of a ring's axis"
+        "the colour of this mark means nothing; paint it pure red (255, 0, 0) for an insertion, green (0, 255, 0) for "
+        "an attachment or blue (0, 0, 255) for the end of a ring's axis"
     )
     return [MarkFault("wrong-colour", text, _at(point)) for point in wrong]

@@ -171,6 +171,10 @@ def parse_muscles(text: str, source: str) -> dict[str, AnyMuscle]:
             raise AssetError(f"{source}: muscle {name!r} {fault}")
         if not name.replace("_", "").isalnum() or not name.isascii():
             raise AssetError(f"{source}: {name!r} is no name for a muscle; use letters, digits and underscores")
+        if isinstance(muscle, LidMuscle) and not muscle.paired and side_of(name) == "middle":
+            raise AssetError(
+                f"{source}: muscle {name!r} closes the lids of one eye; its name must end in _left or _right"
+            )
         twin = name.rpartition("_")[0] if side_of(name) != "middle" else ""
         if twin in table and table[twin].paired:
             raise AssetError(f"{source}: muscle {name!r} is given twice: the paired {twin!r} has that side too")

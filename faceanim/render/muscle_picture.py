@@ -31,6 +31,8 @@ _FOV = 0.3
 """Angle of view that is as good as none [degree]."""
 _MUTED, _DARKEST = 0.62, 38.0
 """How the face is toned down under the marks: value * _MUTED + _DARKEST, so that nothing of it is as bright as a line."""
+_DIRECTIONS = 24
+"""From how many sides the openness to light is looked at in pictures of muscles."""
 _SIZES = (64, 4096)
 
 
@@ -52,8 +54,8 @@ def muscle_image(
 def face_picture(face: Face, kind: str, size: int) -> Bytes:
     """Return the face toned down, from the front without perspective or unrolled, (size, size, 3) RGB bytes."""
     view = projection_of(face, kind)
-    texture = Texture.of(face.texture)
-    shade = vertex_openness(face.mesh.points, face.mesh.triangles)
+    texture = _texture(face) if size <= 1024 else Texture.of(face.texture)
+    shade = _openness(face)
     skin = DrawItem(
         face.mesh.points,
         face.mesh.triangles,
@@ -144,7 +146,7 @@ class _Paths:
         self.origin = np.array([m.origin for m in linear]).reshape(-1, 3)
         self.via = [np.array([p for p in (m.origin, m.via, m.insertion) if p is not None]) for m in linear]
         self.over = self._on_skin(places, self.origin)
-        share = np.linspace(0.0, 1.0, 9)[:, None, None]
+        share = np.linspace(0.0, 1.0, 6)[:, None, None]
         between = (1.0 - share) * self.over + share * self.insertion
         self.along = self._on_skin(places, between.reshape(-1, 3)).reshape(len(share), -1, 3)
         self.rings = [r for name in RINGS if (r := _ring(rows, places, name)) is not None]
@@ -160,7 +162,7 @@ def _ring(rows: Mapping[str, AnyMuscle], places: Places, name: str) -> tuple[Flo
     ring, ends = tallest_ring(rows, name), places.axis_ends(rows, name)
     if ring is None or ends is None:
         return None
-    turn = np.linspace(0.0, 2.0 * np.pi, 73)
+    turn = np.linspace(0.0, 2.0 * np.pi, 37)
     x = ring.centre[0] + ring.axes[0] * np.cos(turn)
     y = ring.centre[1] + ring.axes[1] * np.sin(turn)
     far = places.face.mesh.points[:, 2].max() + 10.0
@@ -191,12 +193,7 @@ def _skin_view(face: Face, paths: _Paths, view: str, size: int) -> Bytes:
 
 def _skull_view(face: Face, paths: _Paths, view: str, size: int) -> Bytes:
     camera = Camera.named(view, face.mesh.points)
-    bones = [Part("bone", m.points, m.triangles) for m in (face.cranium, face.jaw_mesh)]
-    teeth = [Part(p.name, p.points, p.triangles, p.colour) for p in face.parts if p.name.startswith("teeth")]
-    items = [DrawItem(p.points, p.triangles, replace(MATERIALS["bone"], shade_radius=0.0, shade=0.0, casts=True),
-                      occlusion=vertex_openness(p.points, p.triangles, directions=48)) for p in bones]  # fmt: skip
-    items += [DrawItem(p.points, p.triangles, MATERIALS["teeth"], vertex_colour=p.colour / 255.0) for p in teeth]
-    renderer = Renderer(size, camera, items)
+    renderer = Renderer(size, camera, _skull_items(face))
     picture = renderer.draw().copy()
     pen = _Pen(picture, camera, renderer.depth().min(axis=2), 3.0)
     for line in paths.via:
@@ -209,13 +206,27 @@ def _skull_view(face: Face, paths: _Paths, view: str, size: int) -> Bytes:
 
 
 @lru_cache(maxsize=2)
+def _skull_items(face: Face) -> list[DrawItem]:
+    bone = replace(MATERIALS["bone"], shade_radius=0.0, shade=0.0, casts=True)
+    shaded = [
+        (m, vertex_openness(m.points, m.triangles, directions=_DIRECTIONS)) for m in (face.cranium, face.jaw_mesh)
+    ]
+    items = [DrawItem(mesh.points, mesh.triangles, bone, occlusion=openness) for mesh, openness in shaded]
+    for part in face.parts:
+        if part.name.startswith("teeth"):
+            items.append(DrawItem(part.points, part.triangles, MATERIALS["teeth"], vertex_colour=part.colour / 255.0))
+    return items
+
+
+@lru_cache(maxsize=2)
 def _texture(face: Face) -> Texture:
-    return Texture.of(face.texture)
+    """The skin's texture, no finer than a picture of a few hundred pixels can show."""
+    return Texture.of(cv2.resize(face.texture, (1024, 1024), interpolation=cv2.INTER_AREA))
 
 
 @lru_cache(maxsize=2)
 def _openness(face: Face) -> Floats:
-    return vertex_openness(face.mesh.points, face.mesh.triangles)
+    return vertex_openness(face.mesh.points, face.mesh.triangles, directions=_DIRECTIONS)
 
 
 class _Pen:

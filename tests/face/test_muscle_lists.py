@@ -116,6 +116,7 @@ GOOD = 'kind = "linear"\norigin = [1.0, 2.0, 3.0]\ninsertion = [4.0, 5.0, 6.0]\n
         (f"[m]\n{GOOD}colour = 3\n", "colour"),
         (f'["m m!"]\n{GOOD}', "no name"),
         (f"[m]\n{GOOD}[m_left]\n{GOOD}", "twice"),
+        ('[m]\nkind = "lid"\nforce = 1.0\nreach = 5.0\npaired = false\n', "_left"),
         ('[m]\nkind = "ghost"\n', "ghost"),
         ("[m\n", "TOML"),
     ],

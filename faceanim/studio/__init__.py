@@ -1,0 +1,1 @@
+"""The studio: a page in the browser to animate a face and to place its muscles."""
