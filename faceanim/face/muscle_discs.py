@@ -22,6 +22,8 @@ WIDTHS = (20.0, 26.0, 24.0)
 """Hues of red, green and blue marks, and how far a mark's hue may be off [degree]."""
 MOST_TOGETHER = 8
 SMALLEST_RADIUS = 1.5
+MOST_BLOBS = 250
+"""Of one colour; a picture with more is no muscle image, and its blobs are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +173,7 @@ def _fit_colour(
     """Return the centres (n, 2) of the discs of one colour; usual : their radius [pixel], about."""
     least = max(4.0, 0.2 * np.pi * usual**2)
     marks = [k for k in marks if least <= blobs.stats[k, 4] <= 14 * np.pi * usual**2]
-    if usual == 0.0 or not marks:
+    if usual == 0.0 or not 0 < len(marks) <= MOST_BLOBS:
         return np.zeros((0, 2))
     paint = _paint(lead, picture, blobs, marks, amount)
     patches = [_patch(lead, others, picture, blobs, k, paint) for k in marks]

@@ -20,8 +20,8 @@ WORKING_SIDE = 1024
 """Larger pictures are reduced to this before lines are looked for [pixel]."""
 MOST_BEND = 0.13
 """Greatest sagitta of a line, in its length."""
-BRIDGE, MIXED = 0, 1
-"""Candidates between an attachment and an insertion, and between two marks of one kind."""
+MOST_PATHS, MOST_PIECES = 1500, 50
+"""Candidates and loose pieces that are looked at; more are seen in noise only."""
 UNEXPLAINED = 0.18
 ALONE = 2.0
 """Costs of leaving white unexplained [per pixel's length] and a mark without line; a line costs 1."""
@@ -174,9 +174,20 @@ def _support(sight: _Sight, course: Floats) -> tuple[Floats, Floats, Floats]:
     return mean, worst, count / course.shape[-2]
 
 
+def _hopeful(sight: _Sight) -> np.ndarray:
+    """Return (h, w) what may be white at best: the greatest within a pixel, and all that is hidden."""
+    near = cv2.dilate(np.minimum(sight.white / sight.peak, 1.0), np.ones((3, 3), np.uint8))
+    return np.maximum(near, sight.hidden)
+
+
 def _straight(sight: _Sight, place: Floats, kind: Ints, radius: float) -> _Paths:
     """Return the straight candidates with white all along."""
     pair, mixed = _pairs(place, kind)
+    if not len(pair):
+        return _paths([])
+    # Most pairs are ruled out by a few places between them.
+    likely = _read(_hopeful(sight), _course(place[pair[:, 0]], place[pair[:, 1]], 0.0, 16)).min(axis=1) > 0.3
+    pair, mixed = pair[likely], mixed[likely]
     length = np.hypot(*(place[pair[:, 1]] - place[pair[:, 0]]).T)
     keep: list[tuple[Ints, float, Floats]] = []
     limit = 10 * sight.unit
@@ -209,6 +220,8 @@ def _cost(mean: float, worst: float, bend: float, mixed: int) -> float:
 
 
 def _paths(keep: list[tuple[Ints, float, Floats]]) -> _Paths:
+    """Return candidates, the cheapest if there are more than any picture needs."""
+    keep = sorted(keep, key=lambda k: k[1])[:MOST_PATHS]
     pair = np.array([k[0] for k in keep], np.int32).reshape(-1, 2)
     return _Paths(pair, np.array([k[1] for k in keep], float), [k[2] for k in keep])
 
@@ -224,8 +237,7 @@ def _bent(sight: _Sight, place: Floats, kind: Ints, radius: float, left: np.ndar
     sure = wanted[pair].any(axis=1)
     pair, mixed = pair[sure], mixed[sure]
     length = np.hypot(*(place[pair[:, 1]] - place[pair[:, 0]]).T)
-    # What may be white at best: its greatest within a pixel, and all under marks.
-    hopeful = np.maximum(cv2.dilate(np.minimum(sight.white / sight.peak, 1.0), np.ones((3, 3), np.uint8)), sight.hidden)
+    hopeful = _hopeful(sight)
     keep: list[tuple[Ints, float, Floats]] = []
     for k in np.flatnonzero((length > 2.0 * radius + 4.0) & (length < 330.0 * sight.unit)):
         start, end = place[pair[k, 0]], place[pair[k, 1]]
@@ -383,7 +395,8 @@ def _pieces(sight: _Sight, left: np.ndarray) -> list[Floats]:
         if area > 1.8 * sight.width * reach or np.percentile(bright, 75) < 0.7 * sight.peak:
             continue
         tips.append(points[[np.argmin(along), np.argmax(along)]])
-    return _linked(sight, tips)
+    tips.sort(key=lambda tip: -float(np.hypot(*(tip[1] - tip[0]))))
+    return _linked(sight, tips[:MOST_PIECES])
 
 
 def _linked(sight: _Sight, tips: list[Floats]) -> list[Floats]:
