@@ -11,7 +11,6 @@ from faceanim.geometry.distance import DistanceGrid
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Floats, Ints, floats
 from faceanim.ground.errors import UserError
-from faceanim.kernels import distance_field as kernels
 
 _LARGEST_GRID = 60_000_000
 # Grid lines are moved off round numbers by this share of a cell, so that none runs along an edge of a mesh.
@@ -20,6 +19,8 @@ _OFFSET = np.array([0.0123456789, 0.0171572875, 0.0157179672])
 
 def point_distance(points: Floats, mesh: TriMesh) -> tuple[Floats, Ints]:
     """Return the unsigned distance of `points` (n, 3) to `mesh`, (n,) [mm], and the nearest triangle, (n,)."""
+    from faceanim.kernels import distance_field as kernels
+
     points = floats("points", points, None, 3)
     corners = np.ascontiguousarray(mesh.points[mesh.triangles])
     if not len(corners):
@@ -35,6 +36,8 @@ def point_distance(points: Floats, mesh: TriMesh) -> tuple[Floats, Ints]:
 
 def _winding(corners: Floats, origin: Floats, spacing: float, shape: tuple[int, ...]) -> np.ndarray:
     """Mean winding number on the grid, seen along the six directions of its lines, (nx, ny, nz)."""
+    from faceanim.kernels import distance_field as kernels
+
     total = np.zeros(shape, dtype=np.float32)
     for axis in range(3):
         order = [axis, (axis + 1) % 3, (axis + 2) % 3]
@@ -64,6 +67,8 @@ def signed_distance_grid(
     spacing, margin (around the meshes), band : [mm];  symmetric : mirror about x = 0, exactly
     even : an even number of samples along x, so that x = 0 lies between two (only with `symmetric`)
     """
+    from faceanim.kernels import distance_field as kernels
+
     low = np.min([m.points.min(axis=0) for m in meshes], axis=0) - margin
     high = np.max([m.points.max(axis=0) for m in meshes], axis=0) + margin
     if symmetric:

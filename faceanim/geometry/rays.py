@@ -16,24 +16,32 @@ def first_hit(start: Floats, direction: Floats, mesh: TriMesh, reach: float) -> 
 
     start, direction : (n, 3), direction of unit length;  inf and -1 where it misses `mesh` within `reach` [mm]
     """
-    a = mesh.points[mesh.triangles[:, 0]]
-    u = mesh.points[mesh.triangles[:, 1]] - a
-    v = mesh.points[mesh.triangles[:, 2]] - a
+    corner = mesh.points[mesh.triangles]
+    centre = corner.mean(axis=1)
+    size = (np.linalg.norm(corner - centre[:, None], axis=2).max(axis=1, initial=0.0) * (1.0 + _EDGE)) ** 2
     out, triangle = np.full(len(start), np.inf), np.full(len(start), -1, dtype=np.int32)
     for i, (p, d) in enumerate(zip(start, direction, strict=True)):
-        h = np.cross(d, v)
-        det = np.einsum("tk,tk->t", u, h)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            w = p - a
-            s = np.einsum("tk,tk->t", w, h) / det
-            q = np.cross(w, u)
-            r = q @ d / det
-            far = np.einsum("tk,tk->t", v, q) / det
-            hit = np.flatnonzero((s >= -_EDGE) & (r >= -_EDGE) & (s + r <= 1.0 + _EDGE) & (far >= 0) & (far <= reach))
-        if len(hit):
-            triangle[i] = hit[far[hit].argmin()]
-            out[i] = far[triangle[i]]
+        way = centre - p
+        near = np.flatnonzero(np.einsum("tk,tk->t", way, way) - (way @ d) ** 2 <= size + _EDGE)
+        far = _distances(corner[near], p, d, reach)
+        if len(near) and np.isfinite(far).any():
+            triangle[i], out[i] = near[far.argmin()], far.min()
     return out, triangle
+
+
+def _distances(corner: Floats, p: Floats, d: Floats, reach: float) -> Floats:
+    """Return how far the ray from p along d runs to each triangle with `corner` (t, 3, 3), (t,); inf where it misses."""
+    a, u, v = corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    h = np.cross(d, v)
+    det = np.einsum("tk,tk->t", u, h)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = p - a
+        s = np.einsum("tk,tk->t", w, h) / det
+        q = np.cross(w, u)
+        r = q @ d / det
+        far = np.einsum("tk,tk->t", v, q) / det
+        hit = (s >= -_EDGE) & (r >= -_EDGE) & (s + r <= 1.0 + _EDGE) & (far >= 0) & (far <= reach)
+    return np.where(hit, far, np.inf)
 
 
 def ray_hit(start: Floats, direction: Floats, mesh: TriMesh, reach: float) -> Floats:
