@@ -208,8 +208,15 @@ def _coloured(part: Any) -> bytes:
 
     colour = np.round(255.0 * linear(np.asarray(part.colour, dtype=np.float64) / 255.0)).astype(np.uint8)
     mesh = trimesh.Trimesh(part.points, part.triangles, vertex_colors=colour, process=False)
-    data: Any = mesh.export(file_type="glb")
-    return bytes(data)
+
+    def unlike_metal(tree: dict[str, Any]) -> None:
+        # What has no material of its own is shown as metal, which is black where nothing is mirrored.
+        tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.45}}]
+        for primitive in (p for one in tree["meshes"] for p in one["primitives"]):
+            primitive["material"] = 0
+
+    export: Any = trimesh.exchange.gltf.export_glb
+    return bytes(export(trimesh.Scene(mesh), tree_postprocessor=unlike_metal))
 
 
 def _bytes(colour: tuple[float, float, float]) -> tuple[int, int, int]:

@@ -260,6 +260,20 @@ def test_two_clicks_place_a_muscle_that_outlives_the_page(page: Page, browser: A
     again.close()
 
 
+def test_a_page_from_elsewhere_is_turned_away(server: Server) -> None:
+    """A connection that names another server as its origin is closed before anything is sent."""
+    import viser
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    protocol: Any = f"viser-v{viser.__version__}"
+    address = server.address.replace("http", "ws")
+    with connect(address, subprotocols=[protocol], origin="http://elsewhere.example") as socket:
+        with pytest.raises(ConnectionClosed) as closed:
+            socket.recv(timeout=10)
+    assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
+
+
 BAD_FILES = [
     ("muscles.toml", b"[x\n", "muscles.toml"),
     ("picture.png", b"no picture at all", "is not a picture"),
