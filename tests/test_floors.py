@@ -118,9 +118,10 @@ def test_kernels_see_only_the_ground_and_lower_kernels(module: str) -> None:
 @pytest.mark.parametrize(
     ("statement", "heavy"),
     [
-        ("import faceanim", {"numpy", "numba", "scipy", "cv2", "matplotlib", "rich", "msgspec"}),
-        ("import faceanim.cli.main", {"numpy", "numba", "scipy", "cv2", "matplotlib", "rich", "msgspec"}),
+        ("import faceanim", {"numpy", "numba", "scipy", "cv2", "matplotlib", "rich", "msgspec", "viser"}),
+        ("import faceanim.cli.main", {"numpy", "numba", "scipy", "cv2", "matplotlib", "rich", "msgspec", "viser"}),
         ("import faceanim.expression.library", {"numba", "scipy", "cv2", "matplotlib", "rich"}),
+        ("import faceanim.face.muscle_check, faceanim.face.face", {"numba", "matplotlib", "rich"}),
     ],
 )
 def test_light_imports_stay_light(statement: str, heavy: set[str]) -> None:

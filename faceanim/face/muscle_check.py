@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from faceanim.face.muscle_image import Fault, MuscleMap, read_picture_marks
-from faceanim.face.muscle_places import PAPER_MUSCLES, RINGS, Places, ring_of
+from faceanim.face.muscle_places import PAPER_MUSCLES, RINGS, Places, tallest_ring
 from faceanim.face.muscles import AnyMuscle, LinearMuscle, SheetMuscle, one_sided
 from faceanim.geometry.distance_field import point_distance
 from faceanim.ground.arrays import Floats
@@ -84,9 +84,8 @@ def _missing(table: Mapping[str, AnyMuscle]) -> list[Fault]:
     """Muscles of the 23 that are not there."""
     wanted = [f"{name}_{side}" for name in PAPER_MUSCLES for side in ("left", "right")]
     absent = [name for name in wanted if name not in table]
-    absent += [ring for ring in RINGS if not any(ring_of(name) == ring for name in table)]
-    return [Fault("missing", f"{name} is missing; it is one of the 23 muscles", "warning", None, n) for n in absent
-            for name in (n.replace("_", " "),)]  # fmt: skip
+    absent += [ring for ring in RINGS if tallest_ring(table, ring) is None]
+    return [Fault("missing", f"{n} is missing; it is one of the 23 muscles", "warning", None, n) for n in absent]
 
 
 def _sorted(faults: list[Fault]) -> list[Fault]:

@@ -242,11 +242,12 @@ def test_a_mark_on_an_eyeball_is_off_the_skin() -> None:
 
 
 def test_each_missing_muscle_is_named() -> None:
-    """All but one of the 23 are there."""
-    rows = {n: m for n, m in ROWS.items() if n != "risorius_left"}
+    """All but two of the 23 are there; the lid muscle, which needs no marks, does not stand for the ring."""
+    rows = {n: m for n, m in ROWS.items() if n not in ("risorius_left", "orbicularis_oculi_orbital_right")}
     picture, _ = muscle_image(FACE, rows, "cylinder", places=PLACES)
     for faults in (check_picture(picture, FACE, places=PLACES), check_table(rows, FACE, places=PLACES)):
-        assert [(f.code, f.muscle, f.severity) for f in faults] == [("missing", "risorius_left", "warning")]
+        assert [f.muscle for f in faults] == ["risorius_left", "orbicularis_oculi_right"]
+        assert {(f.code, f.severity) for f in faults} == {("missing", "warning")}
 
 
 def test_a_picture_without_muscles_is_refused() -> None:
