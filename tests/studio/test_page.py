@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toys import toy_body, toy_face
 
 from faceanim.backends.solver import StepReport
 from faceanim.face.library import asset_text, load_face
@@ -21,7 +22,6 @@ from faceanim.studio.placing import BONE, RING, SKIN, Placer
 from faceanim.studio.recorder import Recorder
 from faceanim.studio.simulation import Moment
 from faceanim.studio.skin_layers import region_above, skin_layers
-from tests.toys import toy_body, toy_face
 
 TABLE = parse_muscles(asset_text("muscles.toml"), "muscles.toml")
 AHEAD = np.array([0.0, 0.0, -1.0])

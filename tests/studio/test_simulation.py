@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toys import MUSCLES, ToyOptions, toy_body, toy_face
 
 from faceanim.backends import BACKENDS
 from faceanim.expression.action_units import Jaw
@@ -16,7 +17,6 @@ from faceanim.ground.errors import UserError
 from faceanim.studio.engine import STEP, Setup
 from faceanim.studio.mixing import Demands, Mixer
 from faceanim.studio.simulation import LiveSimulation, Moment, Target
-from tests.toys import MUSCLES, ToyOptions, toy_body, toy_face
 
 WHO = "zygomaticus_major_left"
 
