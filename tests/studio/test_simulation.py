@@ -44,7 +44,7 @@ def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     """Register the toy backend and return something to watch with."""
-    monkeypatch.setitem(BACKENDS, "toy", "tests.toys:ToySolver")
+    monkeypatch.setitem(BACKENDS, "toy", "toys:ToySolver")
     return Watch()
 
 
