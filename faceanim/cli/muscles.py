@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from faceanim.cli.choices import add_face, face_asked, whole
-from faceanim.ground.errors import RunError, UserError, unknown_name
+from faceanim.ground.errors import UserError, unknown_name
+from faceanim.ground.files import write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -79,16 +80,6 @@ def _free(path: Path, suffix: str, force: bool) -> Path:
     return path
 
 
-def _write(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_bytes(data)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise RunError(f"{path} could not be written: {error.strerror or error}") from error
-
-
 # map
 
 
@@ -120,8 +111,8 @@ def _map(args: argparse.Namespace) -> int:
     table = paired(table, TWINS)
     rows = _rows(found, face, one_sided(table))
     head = f"Muscles read from a {found.kind} image on the face {face.name} ({face.density}); head frame [mm], forces [mN]."
-    _write(out, muscles_text(table, _notes(table, rows), head).encode())
-    _write(others[0], _csv(rows).encode())
+    write_whole(out, muscles_text(table, _notes(table, rows), head).encode())
+    write_whole(others[0], _csv(rows).encode())
     write_png(others[1], _views(face, table))
     if not args.quiet:
         _print_rows(rows)

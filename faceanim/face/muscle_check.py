@@ -9,7 +9,7 @@ import numpy as np
 
 from faceanim.face.muscle_image import Fault, MuscleMap, read_picture_marks
 from faceanim.face.muscle_places import PAPER_MUSCLES, RINGS, Places, tallest_ring
-from faceanim.face.muscles import AnyMuscle, LinearMuscle, SheetMuscle, one_sided
+from faceanim.face.muscles import AnyMuscle, LinearMuscle, SheetMuscle, build_muscles, one_sided
 from faceanim.geometry.distance_field import point_distance
 from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import AssetError
@@ -43,16 +43,10 @@ def check_table(table: Mapping[str, AnyMuscle], face: Face, *, places: Places | 
         faults += _off_layers(linear, face, places)
     for name, row in rows.items():
         try:
-            _build(name, row, face)
+            build_muscles({name: row}, face.terrain)
         except AssetError as error:
             faults.append(Fault("no-skin", str(error), "error", None, name))
     return _sorted([*faults, *_missing(rows)])
-
-
-def _build(name: str, row: AnyMuscle, face: Face) -> None:
-    from faceanim.face.muscles import build_muscles
-
-    build_muscles({name: row}, face.terrain)
 
 
 def _off_layers(linear: Mapping[str, LinearMuscle | SheetMuscle], face: Face, places: Places) -> list[Fault]:

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from faceanim.ground.errors import RunError, UserError
+from faceanim.ground.files import not_written, write_whole
 from faceanim.render.overlay import text_scale, text_size, write_text
 from faceanim.render.shading import Bytes
 
@@ -26,10 +27,6 @@ def _picture(value: Any) -> Bytes:
     if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
         raise UserError(f"a picture must be (h, w, 3) bytes; this one is {picture.shape} of {picture.dtype}")
     return picture
-
-
-def _failed(path: Path, error: OSError) -> RunError:
-    return RunError(f"{path} could not be written: {error.strerror or error}; free some space or choose another folder")
 
 
 def _probe(folder: Path) -> None:
@@ -62,15 +59,7 @@ def _write_png(target: Path, picture: Bytes) -> None:
     done, data = cv2.imencode(".png", picture[:, :, ::-1])
     if not done:
         raise RunError(f"{target} could not be encoded as PNG")
-    part = target.with_name(f".{target.name}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(data.tobytes())
-        part.replace(target)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise _failed(target, error) from error
+    write_whole(target, data.tobytes())
 
 
 class FrameWriter(Protocol):
@@ -206,7 +195,7 @@ class Film(_Context):
         try:
             self._part.replace(self.path)
         except OSError as error:
-            raise _failed(self.path, error) from error
+            raise not_written(self.path, error) from error
 
     def abandon(self) -> None:
         """Drop what was written."""

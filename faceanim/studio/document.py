@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -23,7 +20,8 @@ from faceanim.face.muscles import (
     parse_muscles,
     side_of,
 )
-from faceanim.ground.errors import FaceanimError, RunError, UserError, unknown_name
+from faceanim.ground.errors import FaceanimError, UserError, unknown_name
+from faceanim.ground.files import not_written, write_whole
 
 FILE, JOURNAL = "muscles.toml", "history.jsonl"
 MOST_STATES = 200
@@ -191,7 +189,7 @@ class MuscleDocument:
     # Files
 
     def _save(self) -> None:
-        write_whole(self.folder / FILE, self.text.encode())
+        write_whole(self.folder / FILE, self.text.encode(), lasting=True)
 
     def _append(self, line: _Line) -> None:
         path = self.folder / JOURNAL
@@ -199,7 +197,7 @@ class MuscleDocument:
             with path.open("ab") as file:
                 file.write(msgspec.json.encode(line) + b"\n")
         except OSError as error:
-            raise _failed(path, error) from error
+            raise not_written(path, error) from error
 
     def _rewrite_journal(self) -> None:
         lines = [_Line(state.label, state.table) for state in self._states]
@@ -245,27 +243,3 @@ class MuscleDocument:
             path.replace(aside)
             self.notices.append(f"{FILE} could not be read and is now {aside.name}: {error}")
             return None
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file in one go: under another name first, then renamed, so that no half of it is ever seen.
-
-    Raises `RunError` if that fails; the former file is then still there.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise _failed(path, error) from error
-
-
-def _failed(path: Path, error: Any) -> RunError:
-    return RunError(
-        f"{path} could not be written ({error.strerror or error}); the change is kept here, but not on disk"
-    )

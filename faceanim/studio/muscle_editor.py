@@ -11,7 +11,8 @@ import numpy as np
 from faceanim.face.muscle_places import Places
 from faceanim.face.muscles import AnyMuscle, build_muscles
 from faceanim.ground.errors import FaceanimError, UserError
-from faceanim.studio.document import MuscleDocument, write_whole
+from faceanim.ground.files import write_whole
+from faceanim.studio.document import MuscleDocument
 from faceanim.studio.drawing import DRAWING
 from faceanim.studio.muscle_files import png_bytes, read_upload
 from faceanim.studio.muscle_shapes import MuscleLines

@@ -213,7 +213,7 @@ def test_a_full_disk_is_reported_and_nothing_lost(tmp_path: Path, monkeypatch: p
     """The change stays in the page, the former file on disk."""
     document = MuscleDocument(tmp_path, FEW)
 
-    def full(path: Path, data: bytes) -> None:
+    def full(path: Path, data: bytes, *, lasting: bool = False) -> None:
         raise RunError(f"{path} could not be written (No space left on device)")
 
     monkeypatch.setattr(rooms, "write_whole", full)
