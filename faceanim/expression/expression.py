@@ -104,11 +104,15 @@ def _targets(name: str, side: Side, index: dict[str, int], asker: str) -> list[t
     if name in index:
         return [(index[name], 1.0 if side == "both" else 0.5)]
     found = [(index[name + end], 1.0) for end in _SIDES[side] if name + end in index]
-    if not found:
-        bases = {n.removesuffix("_left").removesuffix("_right") for n in index}
-        error = unknown_name("muscle", name, bases | set(index) if name.endswith(("_left", "_right")) else bases)
-        raise UserError(f"{asker}: {error}") if asker else error
-    return found
+    if found:
+        return found
+    if asker:
+        raise UserError(
+            f"{asker} needs the muscle {name!r}, which this face lacks; `faceanim muscles map --complete` adds what a "
+            "list of muscles lacks"
+        )
+    bases = {n.removesuffix("_left").removesuffix("_right") for n in index}
+    raise unknown_name("muscle", name, bases | set(index) if name.endswith(("_left", "_right")) else bases)
 
 
 def parse_setting(text: str, what: str) -> tuple[str, float]:

@@ -92,7 +92,7 @@ def test_check_lists_what_is_wrong_and_marks_it(
     assert not image.with_name("front_checked.png").exists()
 
 
-def test_a_picture_without_some_muscles_can_be_completed(tmp_path: Path) -> None:
+def test_a_picture_without_some_muscles_can_be_completed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Those that it lacks come from the built-in list, when asked."""
     few = tmp_path / "few.toml"
     rows = read_muscles(Path(__file__).parents[2] / "assets" / "muscles.toml")
@@ -105,6 +105,9 @@ def test_a_picture_without_some_muscles_can_be_completed(tmp_path: Path) -> None
         out = tmp_path / f"out{len(words)}.toml"
         assert main(["muscles", "map", str(tmp_path / "few.png"), "--out", str(out), "--quiet", *words]) == 0
         assert ("risorius" in read_muscles(out)) is wanted
+    words = ["express", "17", "--muscles", str(tmp_path / "out0.toml"), "--out", str(tmp_path / "frames"), "--quiet"]
+    assert main(words) == 2
+    assert "'mentalis'" in (said := capsys.readouterr().err) and "--complete" in said
 
 
 @pytest.mark.parametrize(
