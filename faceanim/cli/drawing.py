@@ -13,7 +13,7 @@ from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import UserError
 from faceanim.render.colormap import Scale
 from faceanim.render.occlusion import vertex_openness
-from faceanim.render.scene import Part, head_scene
+from faceanim.render.scene import Part, face_scene
 from faceanim.render.shading import Texture
 
 if TYPE_CHECKING:
@@ -103,15 +103,10 @@ def _scene(face: Face, picture: Picture, view: str, **options: Any) -> Any:
             Part("cranium", face.cranium.points, face.cranium.triangles, bone=0),
             Part("jaw", face.jaw_mesh.points, face.jaw_mesh.triangles, bone=1),
         ]
-    skin = options["mode"] == "skin"
-    return head_scene(
-        face.mesh.points,
-        face.mesh.triangles,
+    return face_scene(
+        face,
         size=picture.size,
         view=view,
-        uv=face.uv if skin else None,
-        uv_triangles=face.uv_triangles if skin else None,
-        parts=[Part(part.name, part.points, part.triangles, part.colour, part.bone) for part in face.parts],
         bones=bones,
         bone_opacity=SKULL_OPACITY if picture.show_skull else 0.0,
         wire=WIRE if picture.wireframe else 0.0,

@@ -67,8 +67,10 @@ def run(args: argparse.Namespace) -> int:
     return {"map": _map, "draw": _draw, "check": _check}[args.task](args)
 
 
-def _free(path: Path, suffix: str, force: bool) -> Path:
-    """Return `path` if it may be written; raise `UserError` otherwise."""
+def _free(path: Path, suffix: str, force: bool, source: str | Path = "") -> Path:
+    """Return `path` if it may be written, which `source` may not; raise `UserError` otherwise."""
+    if source and path.resolve() == Path(source).resolve():
+        raise UserError(f"{path} is the picture that is read; choose another name to write to")
     if path.suffix.lower() != suffix:
         raise UserError(f"{path} does not end in {suffix}, the format that is written")
     if path.is_dir():
@@ -86,7 +88,7 @@ def _free(path: Path, suffix: str, force: bool) -> Path:
 def _map(args: argparse.Namespace) -> int:
     out = _free(Path(args.out), ".toml", args.force)
     beside = out.with_suffix(".csv"), out.with_name(f"{out.stem}_views.png")
-    others = [_free(path, path.suffix, args.force) for path in beside]
+    others = [_free(path, path.suffix, args.force, args.image) for path in beside]
     from faceanim.face.muscle_check import picture_faults
     from faceanim.face.muscle_image import map_picture
     from faceanim.face.muscle_places import Places
@@ -229,7 +231,7 @@ def _check(args: argparse.Namespace) -> int:
         return _check_list(args)
     marked = Path(args.marked) if args.marked else path.with_name(f"{path.stem}_checked.png")
     if args.marked:
-        _free(marked, ".png", args.force)
+        _free(marked, ".png", args.force, path)
     from faceanim.face.muscle_check import picture_faults
     from faceanim.face.muscle_image import read_picture_marks
     from faceanim.face.picture_file import read_picture

@@ -21,7 +21,7 @@ from faceanim.render.camera import Camera
 from faceanim.render.occlusion import vertex_openness
 from faceanim.render.overlay import write_text
 from faceanim.render.renderer import DrawItem, Renderer
-from faceanim.render.scene import MATERIALS, SKIN, Part, head_scene
+from faceanim.render.scene import MATERIALS, SKIN, face_scene
 from faceanim.render.shading import Bytes, Look, Texture
 
 if TYPE_CHECKING:
@@ -173,11 +173,7 @@ def _ring(rows: Mapping[str, AnyMuscle], places: Places, name: str) -> tuple[Flo
 
 def _skin_view(face: Face, paths: _Paths, view: str, size: int) -> Bytes:
     camera = Camera.named(view, face.mesh.points)
-    parts = [Part(p.name, p.points, p.triangles, p.colour, p.bone) for p in face.parts]
-    scene = head_scene(
-        face.mesh.points, face.mesh.triangles, size=size, view=camera, uv=face.uv, uv_triangles=face.uv_triangles,
-        texture=_texture(face), parts=parts, occlusion=_openness(face),
-    )  # fmt: skip
+    scene = face_scene(face, size=size, view=camera, texture=_texture(face), occlusion=_openness(face))
     picture = np.round(_MUTED * scene.draw(face.mesh.points) + _DARKEST).astype(np.uint8)
     depth = scene.renderer.depth().min(axis=2)
     pen = _Pen(picture, camera, depth, 4.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from faceanim.render.occlusion import vertex_openness
 from faceanim.render.overlay import draw_colour_bar, draw_legend
 from faceanim.render.renderer import DrawItem, Renderer
 from faceanim.render.shading import Bytes, Look, Material, Texture
+
+if TYPE_CHECKING:
+    from faceanim.face.face import Face
 
 SKIN = Material(
     colour=(0.80, 0.62, 0.53),
@@ -127,6 +130,20 @@ class HeadScene:
             return palette[sets.astype(np.int64)]
         assert self.scale is not None
         return self.scale.colours(floats("values", values, n))
+
+
+def face_scene(face: Face, *, mode: str = "skin", **options: Any) -> HeadScene:
+    """Make the scene of a face with its eyes, teeth, gums and tongue; `options` as `head_scene` takes them."""
+    skin = mode == "skin"
+    return head_scene(
+        face.mesh.points,
+        face.mesh.triangles,
+        uv=face.uv if skin else None,
+        uv_triangles=face.uv_triangles if skin else None,
+        parts=[Part(part.name, part.points, part.triangles, part.colour, part.bone) for part in face.parts],
+        mode=mode,
+        **options,
+    )
 
 
 def head_scene(

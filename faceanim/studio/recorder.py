@@ -136,22 +136,12 @@ class Recorder:
 
 def _scene(face: Any, positions: np.ndarray) -> Any:
     """Return what draws the skin from the front, with room for every moment of `positions` (k, n, 3)."""
-    from faceanim.render.scene import Part, head_scene
+    from faceanim.render.scene import face_scene
     from faceanim.render.shading import Texture
 
     some = positions[:: max(1, len(positions) // 20)]
     bounds = np.concatenate([face.mesh.points, some.min(axis=0), some.max(axis=0)])
-    return head_scene(
-        face.mesh.points,
-        face.mesh.triangles,
-        size=SIZE,
-        view="front",
-        uv=face.uv,
-        uv_triangles=face.uv_triangles,
-        texture=Texture.of(face.texture),
-        parts=[Part(part.name, part.points, part.triangles, part.colour, part.bone) for part in face.parts],
-        bounds=bounds,
-    )
+    return face_scene(face, size=SIZE, texture=Texture.of(face.texture), bounds=bounds)
 
 
 def _next_folder(work: Path) -> Path:

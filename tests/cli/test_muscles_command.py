@@ -72,6 +72,15 @@ def test_nothing_is_overwritten_without_force(image: Path, tmp_path: Path, capsy
     assert cv2.imread(str(picture)) is not None
 
 
+def test_the_picture_that_is_read_is_never_written(image: Path, tmp_path: Path) -> None:
+    """Not even with --force."""
+    source = tmp_path / "m_views.png"
+    source.write_bytes(image.read_bytes())
+    assert main(["muscles", "map", str(source), "--out", str(tmp_path / "m.toml"), "--force"]) == 2
+    assert main(["muscles", "check", str(source), "--marked", str(source), "--force"]) == 2
+    assert source.read_bytes() == image.read_bytes()
+
+
 def test_check_lists_what_is_wrong_and_marks_it(
     image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
