@@ -8,6 +8,7 @@ the `Control`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 from faceanim.tissue.spring_law import SpringLaw
+
+if TYPE_CHECKING:
+    from faceanim.body.solid import Solid
 
 PULL_TO_POINT = 0
 PULL_ALONG = 1
@@ -67,6 +71,12 @@ class Muscles:
     point: Floats
     bone: Ints
     softening: Floats
+
+    @classmethod
+    def none(cls) -> Muscles:
+        """Return no muscles."""
+        ints, floats = np.zeros(0, dtype=np.int32), np.zeros(0)
+        return cls((), floats, ints, ints, floats, ints, np.zeros((0, 3)), ints, floats)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +133,9 @@ class Body:
 
     mass : (n,) [kg]            membrane_modulus : (t,) [kPa mm], Young's modulus times thickness
     damping : [1/s], the force -damping * mass * v   pinned : (n,) carried rigidly by the bones (weights of `attachment`)
+    stiffness_damping : [s], the force -stiffness_damping * K v of a solid (Rayleigh's second coefficient)
     contact_stiffness : [mN/mm per mm^2], penalty pressure per depth
+    solid : the flesh as a volume, None = only the surface is known
     """
 
     surface: TriMesh
@@ -140,6 +152,8 @@ class Body:
     pairs: tuple[PairContact, ...] = ()
     contact_stiffness: float = 20.0
     labels: dict[str, Ints] = field(default_factory=dict)
+    stiffness_damping: float = 0.0
+    solid: Solid | None = None
 
     def __post_init__(self) -> None:
         n, t, b = len(self.surface.points), len(self.surface.triangles), len(self.bones)
@@ -156,6 +170,8 @@ class Body:
                 continue
             if array.shape != shape:
                 raise UserError(f"body: {name} has shape {array.shape}; {shape} is needed")
+        if self.solid is not None and (self.solid.skin.node.shape[0], self.solid.bone_weight.shape[1]) != (n, b):
+            raise UserError(f"body: its solid must carry all {n} surface vertices and know all {b} bones")
         if not (np.isfinite(self.mass).all() and (self.mass > 0).all()):
             raise UserError("body: every mass must be positive and finite")
         if self.muscles.node.size and not 0 <= self.muscles.node.min() <= self.muscles.node.max() < n:

@@ -1,23 +1,50 @@
-"""What drives a body from outside, at one moment: muscle activations and bone poses."""
+"""What drives a body from outside, at one moment: muscle activations, bone poses and loads."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from faceanim.body.body import Body
 from faceanim.ground.arrays import Floats
+from faceanim.ground.errors import UserError
 
 
 @dataclass(eq=False)
 class Control:
-    """activation : (m,) in [0, 1];  bone_pose : (n_bone, 4, 4), rest frame to head frame [mm]."""
+    """What is asked of a body now.
+
+    activation : (m,) in [0, 1]   bone_pose : (n_bone, 4, 4), rest frame to head frame [mm]
+    gravity : (3,) [mm/s^2]   force : (n, 3) on the surface vertices [mN], None = none
+    """
 
     activation: Floats
     bone_pose: Floats
+    gravity: Floats = field(default_factory=lambda: np.zeros(3))
+    force: Floats | None = None
 
     @classmethod
     def rest(cls, body: Body) -> Control:
-        """Return the control that asks for nothing: no activation, every bone where it was built."""
+        """Return the control that asks for nothing: no activation, every bone where it was built, no load."""
         return cls(np.zeros(len(body.muscles.names)), np.tile(np.eye(4), (len(body.bones), 1, 1)))
+
+    @property
+    def loaded(self) -> bool:
+        """Whether gravity or forces act."""
+        return bool(self.gravity.any()) or self.force is not None
+
+    def reject_unfit(self, body: Body) -> None:
+        """Raise `UserError` unless this fits `body` and holds only finite numbers."""
+        for name, value, shape in (
+            ("activation", self.activation, (len(body.muscles.names),)),
+            ("bone_pose", self.bone_pose, (len(body.bones), 4, 4)),
+            ("gravity", self.gravity, (3,)),
+            ("force", self.force, body.surface.points.shape),
+        ):
+            if value is None:
+                continue
+            if np.shape(value) != shape:
+                raise UserError(f"control: {name} has shape {np.shape(value)}; {shape} is needed")
+            if not np.isfinite(value).all():
+                raise UserError(f"control: {name} holds a number that is not finite")

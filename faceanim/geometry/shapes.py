@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 
 from faceanim.geometry.surface import TriMesh
+from faceanim.geometry.volume import TetMesh
 from faceanim.ground.errors import UserError
 
 
@@ -87,3 +90,39 @@ def sphere(radius: float, subdivisions: int = 3) -> TriMesh:
         triangles = np.concatenate([np.stack(part, axis=1) for part in parts])
     points = radius * points / np.linalg.norm(points, axis=1, keepdims=True)
     return TriMesh(points, triangles)
+
+
+SPLITS = ("kuhn", "mirrored")
+
+
+def box_tets(cells: tuple[int, int, int], size: tuple[float, float, float], *, split: str = "mirrored") -> TetMesh:
+    """Return a box from the origin to `size` [mm] as cells[0] x cells[1] x cells[2] cubes of six tetrahedra each.
+
+    Node (i, j, k) has the number (i * (cells[1] + 1) + j) * (cells[2] + 1) + k.
+    split : "kuhn" gives every cube the same main diagonal, which makes the box lean sideways under load;
+    "mirrored" turns neighbouring cubes into mirror images, so that it does not
+    """
+    if min(cells) < 1 or not min(size) > 0 or split not in SPLITS:
+        raise UserError(
+            f"box: cells {cells} must be at least 1, sizes {size} positive, split one of {', '.join(SPLITS)}"
+        )
+    axes = [np.linspace(0.0, s, c + 1) for s, c in zip(size, cells, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cell = np.stack(np.meshgrid(*(np.arange(c) for c in cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    flip = cell % 2 if split == "mirrored" else np.zeros_like(cell)
+    stride = np.array([(cells[1] + 1) * (cells[2] + 1), cells[2] + 1, 1])
+    tets = []
+    for path in permutations(range(3)):
+        corner = np.zeros((4, 3), dtype=np.int64)
+        for step, axis in enumerate(path):
+            corner[step + 1 :, axis] = 1
+        at = cell[:, None, :] + (corner[None] ^ flip[:, None, :])
+        even = _parity(path) * np.where(flip.sum(axis=1) % 2, -1, 1) > 0
+        index = (at * stride).sum(axis=2)
+        tets.append(np.where(even[:, None], index, index[:, [0, 2, 1, 3]]))
+    return TetMesh(points, np.stack(tets, axis=1).reshape(-1, 4).astype(np.int32))
+
+
+def _parity(order: tuple[int, ...]) -> int:
+    swaps = sum(order[i] > order[j] for i in range(len(order)) for j in range(i + 1, len(order)))
+    return -1 if swaps % 2 else 1

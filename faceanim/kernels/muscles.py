@@ -11,6 +11,20 @@ from faceanim.ground.jit import kernel
 from faceanim.kernels.linalg3 import add_identity, add_outer
 
 
+@kernel(inline=True)
+def turned(fibres, e, pose):
+    """Return the point or direction of fibre `e`, turned as its bone is."""
+    b = fibres.bone[e]
+    x = fibres.point[e, 0]
+    y = fibres.point[e, 1]
+    z = fibres.point[e, 2]
+    return (
+        pose[b, 0, 0] * x + pose[b, 0, 1] * y + pose[b, 0, 2] * z,
+        pose[b, 1, 0] * x + pose[b, 1, 1] * y + pose[b, 1, 2] * z,
+        pose[b, 2, 0] * x + pose[b, 2, 1] * y + pose[b, 2, 2] * z,
+    )
+
+
 @kernel
 def aim(fibres, activation, pose, moment):
     """Pack the fibres of the acting muscles into `moment`, with their points and directions in the head frame."""
@@ -22,13 +36,11 @@ def aim(fibres, activation, pose, moment):
             if active == 0.0:
                 continue
             b = fibres.bone[e]
-            x = fibres.point[e, 0]
-            y = fibres.point[e, 1]
-            z = fibres.point[e, 2]
             aims = fibres.kind[e] == 0
-            for r in range(3):
-                place = pose[b, r, 0] * x + pose[b, r, 1] * y + pose[b, r, 2] * z
-                moment.target[count, r] = place + pose[b, r, 3] if aims else place
+            tx, ty, tz = turned(fibres, e, pose)
+            moment.target[count, 0] = tx + pose[b, 0, 3] if aims else tx
+            moment.target[count, 1] = ty + pose[b, 1, 3] if aims else ty
+            moment.target[count, 2] = tz + pose[b, 2, 3] if aims else tz
             moment.pull[count] = active * fibres.strength[e]
             moment.softening[count] = fibres.softening[e] if aims else -1.0
             count += 1
@@ -63,6 +75,28 @@ def fibre_force(x, moment, m, force):
             force[i, 1] += fy
             force[i, 2] += fz
             force[i, 3] += k
+
+
+@kernel
+def pull(fibres, activation, pose, x, force):
+    """Add the pulls of all acting muscles on the vertices `x` (n, 3) to `force` (n, 3), without packing them first."""
+    for i in range(len(x)):
+        for e in range(fibres.start[i], fibres.start[i + 1]):
+            active = activation[fibres.muscle[e]]
+            if active == 0.0:
+                continue
+            dx, dy, dz = turned(fibres, e, pose)
+            f = active * fibres.strength[e]
+            if fibres.kind[e] == 0:
+                b = fibres.bone[e]
+                eps = fibres.softening[e]
+                dx += pose[b, 0, 3] - x[i, 0]
+                dy += pose[b, 1, 3] - x[i, 1]
+                dz += pose[b, 2, 3] - x[i, 2]
+                f /= math.sqrt(dx * dx + dy * dy + dz * dz + eps * eps)
+            force[i, 0] += f * dx
+            force[i, 1] += f * dy
+            force[i, 2] += f * dz
 
 
 @kernel

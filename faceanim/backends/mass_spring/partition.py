@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -14,12 +12,13 @@ from faceanim.body.body import Body
 from faceanim.body.control import Control
 from faceanim.geometry import topology
 from faceanim.ground.arrays import Bools, Floats, Ints
-from faceanim.ground.jit import user_cache, writable_folder
+from faceanim.ground.cache import content_key as cache_key
+from faceanim.ground.cache import load_arrays, save_arrays
 
 STATIC, QUASI_STATIC, DYNAMIC = 0, 1, 2
 FAINT = 0.05
 """Share of a muscle's strongest pull per area at which its zone ends."""
-_VERSION = b"3"
+_VERSION = "partition 4"
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,65 +139,45 @@ def compute(body: Body, controls: Sequence[Control], tolerance: float, solve: So
 
 def content_key(body: Body, controls: Sequence[Control], tolerance: float) -> str:
     """Return a hash of everything that shapes a partition."""
-    digest = hashlib.sha256(_VERSION)
-    u, a, s = body.muscles, body.attachment, body.surface
-    for array in (
+    u, a, s, contact = body.muscles, body.attachment, body.surface, body.bone_contact
+    parts: list[object] = [
         s.points, s.triangles, body.mass, body.membrane_modulus, body.pinned, a.bone_weight, a.stiffness, u.max_force,
-        u.muscle, u.node, u.weight, u.kind, u.point, u.bone, u.softening,
-        *(array for array in (a.shear, a.shear_limit) if array is not None),
-    ):  # fmt: skip
-        digest.update(np.ascontiguousarray(array).tobytes())
+        u.muscle, u.node, u.weight, u.kind, u.point, u.bone, u.softening, a.shear, a.shear_limit,
+    ]  # fmt: skip
     for bone in body.bones:
         if bone.grid is not None:
-            digest.update(np.ascontiguousarray(bone.grid.values).tobytes())
-            digest.update(repr((bone.grid.origin.tolist(), bone.grid.spacing)).encode())
-    if body.bone_contact is not None:
-        for array in (body.bone_contact.node, body.bone_contact.bone, body.bone_contact.clearance):
-            digest.update(np.ascontiguousarray(array).tobytes())
+            parts += [bone.grid.values, bone.grid.origin, bone.grid.spacing]
+    if contact is not None:
+        parts += [contact.node, contact.bone, contact.clearance]
     for ball in body.spheres:
-        digest.update(repr((ball.centre.tolist(), ball.radius)).encode())
-        digest.update(ball.node.tobytes() + ball.clearance.tobytes())
+        parts += [ball.centre, ball.radius, ball.node, ball.clearance]
     for pair in body.pairs:
-        digest.update(pair.node.tobytes() + pair.start.tobytes() + pair.triangle.tobytes() + repr(pair.gap).encode())
-    digest.update(repr((body.law, a.alpha, a.s0, body.contact_stiffness, tolerance)).encode())
+        parts += [pair.node, pair.start, pair.triangle, pair.gap]
+    parts.append((body.law, a.alpha, a.s0, body.contact_stiffness, tolerance))
     for control in controls:
-        digest.update(np.round(control.activation, 6).tobytes() + np.round(control.bone_pose, 6).tobytes())
-    return digest.hexdigest()[:32]
-
-
-def _path(key: str) -> Path:
-    return writable_folder(user_cache() / "partitions", "partition cache") / f"{key}.npz"
+        parts += [np.round(control.activation, 6), np.round(control.bone_pose, 6)]
+    return cache_key(_VERSION, *parts)
 
 
 def load(key: str, n: int) -> Partition | None:
     """Return the partition cached under `key`, or None if there is none that fits `n` vertices."""
-    path = _path(key)
+    held = load_arrays("partitions", key)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if file["node_set"].shape != (n,) or file["wave"].shape != (n,):
-                return None
-            numbers = file["numbers"]
-            return Partition(
-                file["node_set"], file["wave"], file["muscles"], file["bones"], float(numbers[0]), float(numbers[1]),
-                float(numbers[2]), 0.0,
-            )  # fmt: skip
-    except (OSError, KeyError, ValueError, EOFError):
+        if held is None or held["node_set"].shape != (n,) or held["wave"].shape != (n,):
+            return None
+        threshold, worst, rms = (float(v) for v in held["numbers"])
+        return Partition(held["node_set"], held["wave"], held["muscles"], held["bones"], threshold, worst, rms, 0.0)
+    except (KeyError, ValueError):
         return None
 
 
 def save(key: str, partition: Partition) -> None:
     """Cache `partition` under `key`; a folder that cannot be written is no error."""
-    path = _path(key)
-    scratch = path.with_name(f"{path.stem}.{id(partition)}.npz")
     numbers = np.array([partition.threshold, partition.error_max, partition.error_rms])
-    try:
-        np.savez(
-            scratch, node_set=partition.node_set, wave=partition.wave, muscles=partition.muscles,
-            bones=partition.bones, numbers=numbers,
-        )  # fmt: skip
-        scratch.replace(path)
-    except OSError:
-        scratch.unlink(missing_ok=True)
+    save_arrays(
+        "partitions", key, node_set=partition.node_set, wave=partition.wave, muscles=partition.muscles,
+        bones=partition.bones, numbers=numbers,
+    )  # fmt: skip
 
 
 def widened(body: Body, partition: Partition, positions: Floats) -> Partition:

@@ -110,15 +110,13 @@ class SolverMassSpring:
         return StateMassSpring(q, np.zeros_like(q), 0.0, q.copy(), np.zeros_like(q), 0.0)
 
     def check(self, control: Control) -> None:
-        """Raise `UserError` unless `control` fits the body and holds only finite numbers."""
-        for name, value, shape in (
-            ("activation", control.activation, (len(self.body.muscles.names),)),
-            ("bone_pose", control.bone_pose, (len(self.body.bones), 4, 4)),
-        ):
-            if np.shape(value) != shape:
-                raise UserError(f"control: {name} has shape {np.shape(value)}; {shape} is needed")
-            if not np.isfinite(value).all():
-                raise UserError(f"control: {name} holds a number that is not finite")
+        """Raise `UserError` unless `control` fits the body, holds only finite numbers and asks for no loads."""
+        control.reject_unfit(self.body)
+        if control.loaded:
+            raise UserError(
+                "mass_spring: gravity and forces are not modelled, since the skin's rest shape already hangs; "
+                "choose another backend, or a muscle that pulls along a direction"
+            )
 
     def surface(self, state: State, out: np.ndarray) -> None:
         """Write the surface points (n, 3) [mm] into `out`."""
