@@ -31,11 +31,17 @@ def carried(solid: Solid, pose: Floats) -> Floats:
 
 def fibre_table(muscle: Muscles, n: int) -> Fibres:
     """Return the fibres of all muscles sorted by the vertex that they pull, of `n` vertices."""
-    order = grouped(muscle.node, np.arange(len(muscle.node)), n)
-    k = order.item
-    strength = muscle.max_force[muscle.muscle[k]] * muscle.weight[k]
-    columns = (muscle.muscle[k], muscle.kind[k], muscle.bone[k], strength, muscle.point[k], muscle.softening[k])
-    return Fibres(order.start, *(np.ascontiguousarray(c) for c in columns))
+    rows = grouped(muscle.node, np.arange(len(muscle.node), dtype=np.int32), n)
+    k = rows.item
+    return Fibres(
+        rows.start,
+        muscle.muscle[k],
+        muscle.kind[k],
+        muscle.bone[k],
+        muscle.max_force[muscle.muscle[k]] * muscle.weight[k],
+        np.ascontiguousarray(muscle.point[k]),
+        np.maximum(muscle.softening[k], 1e-3),
+    )
 
 
 class Pull:

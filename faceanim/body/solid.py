@@ -58,7 +58,7 @@ class Solid:
     def node_mass(self) -> Floats:
         """A quarter of the mass of the elements at each node, (n,) [kg]."""
         share = np.repeat(self.density * self.mesh.volumes / 4.0, 4)
-        return np.bincount(self.mesh.tets.ravel(), weights=share, minlength=len(self.mesh.points))
+        return np.asarray(np.bincount(self.mesh.tets.ravel(), share, len(self.mesh.points)), dtype=np.float64)
 
     def lame(self) -> tuple[Floats, Floats]:
         """Return lambda and mu of every element, 2 x (e,) [kPa]."""

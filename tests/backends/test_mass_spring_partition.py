@@ -13,12 +13,13 @@ from faceanim.backends.mass_spring import partition
 from faceanim.backends.mass_spring.options import QUASI_STATIC, Options
 from faceanim.backends.mass_spring.solver import SolverMassSpring
 from faceanim.body.body import Body
+from faceanim.ground import cache
 
 
 @pytest.fixture(autouse=True)
 def own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Keep partitions of tests out of the user's cache (and of each other's)."""
-    monkeypatch.setattr(partition, "user_cache", lambda: tmp_path)
+    monkeypatch.setattr(cache, "user_cache", lambda: tmp_path)
 
 
 def wide_sheet() -> Body:
@@ -128,7 +129,7 @@ def test_a_partition_is_read_back_from_the_cache() -> None:
     assert first.seconds > 0.0 and again.seconds == 0.0
     assert (first.node_set == again.node_set).all() and (first.wave == again.wave).all()
     assert partition.content_key(body, [peak], 0.05) != partition.content_key(body, [peak], 0.06)
-    for file in (partition.user_cache() / "partitions").glob("*.npz"):
+    for file in (cache.user_cache() / "partitions").glob("*.npz"):
         file.write_bytes(b"broken")
     third = SolverMassSpring(body, Options(adaptive=True)).prepare(peak)
     assert third is not None and third.seconds > 0.0
