@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,11 @@ from faceanim.body.body import (
     SphereContact,
 )
 from faceanim.body.control import Control
+from faceanim.body.solid import solid_body
 from faceanim.geometry.distance import DistanceGrid
-from faceanim.geometry.shapes import sheet
+from faceanim.geometry.shapes import box_tets, sheet
 from faceanim.geometry.surface import TriMesh
+from faceanim.tissue.material import Material
 from faceanim.tissue.spring_law import SpringLaw
 
 NO_MUSCLES = Muscles(
@@ -177,3 +180,31 @@ def control(body: Body, activation: Any = 0.0, jaw: float = 0.0) -> Control:
 def crumpled(body: Body, amount: float, seed: int = 3) -> np.ndarray:
     """Return the body's points moved at random by about `amount` [mm], (n, 3)."""
     return body.surface.points + amount * np.random.default_rng(seed).standard_normal(body.surface.points.shape)
+
+
+FLESH = Material("flesh", 1.04e-6, 15.0, 0.4)
+
+
+def bridge(cells: tuple[int, int, int] = (8, 3, 3), **changes: Any) -> Body:
+    """Return a bar of flesh, 40 x 12 x 12 mm, between cranium (x = 0) and jaw (x = 40), with two muscles on its back."""
+    mesh = box_tets(cells, (40.0, 12.0, 12.0))
+    x = mesh.points[:, 0]
+    plain = solid_body(
+        mesh, FLESH, (x < 1e-9) | (x > 40.0 - 1e-9), bone=(x > 20.0).astype(int), bones=("cranium", "jaw")
+    )
+    p = plain.surface.points
+    top = np.flatnonzero((p[:, 1] > 11.9) & (np.abs(p[:, 0] - 20.0) < 11.0)).astype(np.int32)
+    k, zeros = len(top), np.zeros(len(top), np.int32)
+    muscles = Muscles(
+        ("to_point", "along"), np.array([120.0, 60.0]), np.concatenate([zeros, zeros + 1]), np.tile(top, 2),
+        np.full(2 * k, 1.0 / k), np.repeat([PULL_TO_POINT, PULL_ALONG], k).astype(np.int32),
+        np.repeat([[10.0, 40.0, 15.0], [0.0, 0.6, 0.8]], k, axis=0), np.zeros(2 * k, np.int32), np.ones(2 * k),
+    )  # fmt: skip
+    return replace(plain, muscles=muscles, **({"damping": 2000.0, "stiffness_damping": 1e-3} | changes))
+
+
+def cantilever(cells: tuple[int, int, int] = (8, 2, 2), material: Material = FLESH, **changes: Any) -> Body:
+    """Return a bar of flesh, 40 x 10 x 10 mm, held at x = 0 alone."""
+    mesh = box_tets(cells, (40.0, 10.0, 10.0))
+    body = solid_body(mesh, material, mesh.points[:, 0] < 1e-9)
+    return replace(body, **({"damping": 2000.0, "stiffness_damping": 1e-3} | changes))

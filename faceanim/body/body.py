@@ -7,7 +7,9 @@ the `Control`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -135,7 +137,7 @@ class Body:
     damping : [1/s], the force -damping * mass * v   pinned : (n,) carried rigidly by the bones (weights of `attachment`)
     stiffness_damping : [s], the force -stiffness_damping * K v of a solid (Rayleigh's second coefficient)
     contact_stiffness : [mN/mm per mm^2], penalty pressure per depth
-    solid : the flesh as a volume, None = only the surface is known
+    volume : makes `solid` when it is first asked for, None = only the surface is known
     """
 
     surface: TriMesh
@@ -153,7 +155,7 @@ class Body:
     contact_stiffness: float = 20.0
     labels: dict[str, Ints] = field(default_factory=dict)
     stiffness_damping: float = 0.0
-    solid: Solid | None = None
+    volume: Callable[[], Solid] | None = None
 
     def __post_init__(self) -> None:
         n, t, b = len(self.surface.points), len(self.surface.triangles), len(self.bones)
@@ -170,10 +172,18 @@ class Body:
                 continue
             if array.shape != shape:
                 raise UserError(f"body: {name} has shape {array.shape}; {shape} is needed")
-        if self.solid is not None and (self.solid.skin.node.shape[0], self.solid.bone_weight.shape[1]) != (n, b):
-            raise UserError(f"body: its solid must carry all {n} surface vertices and know all {b} bones")
         if not (np.isfinite(self.mass).all() and (self.mass > 0).all()):
             raise UserError("body: every mass must be positive and finite")
         if self.muscles.node.size and not 0 <= self.muscles.node.min() <= self.muscles.node.max() < n:
             raise UserError(f"body: a muscle pulls a vertex outside 0..{n - 1}")
         self.surface.reject_degenerate()
+
+    @cached_property
+    def solid(self) -> Solid | None:
+        """The flesh as a volume, if it is known; growing a face's takes seconds the first time."""
+        if self.volume is None:
+            return None
+        solid, n, b = self.volume(), len(self.surface.points), len(self.bones)
+        if (len(solid.skin.node), solid.bone_weight.shape[1]) != (n, b):
+            raise UserError(f"body: its solid must carry all {n} surface vertices and know all {b} bones")
+        return solid

@@ -125,5 +125,5 @@ def solid_body(
         attachment=Attachment(anchored, np.zeros(len(node))),
         muscles=Muscles.none() if muscles is None else muscles,
         bones=tuple(Bone(name) for name in bones),
-        solid=solid,
+        volume=lambda: solid,
     )

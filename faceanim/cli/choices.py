@@ -34,9 +34,11 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     add_face(group)
     group.add_argument("--muscles", dest="own_muscles", metavar="FILE",
                        help="muscles of one's own, as `faceanim muscles map` writes them")  # fmt: skip
-    group.add_argument("--backend", default="mass_spring", help="how flesh answers (default: %(default)s)")
+    group.add_argument("--backend", default="mass_spring",
+                       help="how flesh answers (`faceanim info backends`; default: %(default)s)")  # fmt: skip
     group.add_argument(
-        "--scheme", help="time stepping: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper"
+        "--scheme",
+        help="time stepping of mass_spring: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper",
     )
     which = group.add_mutually_exclusive_group()
     which.add_argument("--adaptive", dest="adaptive", action="store_true", default=None,
@@ -44,7 +46,8 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--full", dest="adaptive", action="store_false", help="every vertex dynamic")
     group.add_argument("--tolerance", metavar="MM", help="what the adaptive partition may cost in accuracy [mm]")
     group.add_argument("--threads", metavar="N", help="processor cores to use (default: one to simulate, all to draw)")
-    group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[], help="any other backend option")
+    group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[], 
+                       help="any other option of the backend (`faceanim info backends`)")  # fmt: skip
 
 
 def number(text: str | float, option: str, low: float, high: float, *, above: bool = False) -> float:

@@ -142,12 +142,13 @@ def run(args: argparse.Namespace) -> int:
     from faceanim.cli.progress import Progress
     from faceanim.cli.warmup import drawing_compiled
     from faceanim.ground.jit import cache_notice
+    from faceanim.ground.notes import listening
     from faceanim.session.recording import Results
 
     picture = picture_asked(args)
     results = Results(Path(args.out), overwrite=args.force)
     use_threads(args.threads)
-    with Progress(quiet=args.quiet) as progress:
+    with Progress(quiet=args.quiet) as progress, listening(progress.hear):
         progress.stage("loading the face")
         session = session_asked(args)
         for notice in cache_notice():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import fields
 
 from faceanim.ground.errors import unknown_name
 
@@ -102,9 +103,11 @@ def _backends() -> Listing:
 
     rows: list[tuple[str, ...]] = []
     for name in BACKENDS:
-        text = (backend_class(name).__doc__ or "").strip().split("\n")[0]
-        rows.append((name, text))
-    return ("backend", "what it is"), rows
+        solver = backend_class(name)
+        text = (solver.__doc__ or "").strip().split("\n")[0]
+        options = solver.Options()
+        rows.append((name, text, ", ".join(f"{f.name}={getattr(options, f.name)}" for f in fields(options))))
+    return ("backend", "what it is", "options and their defaults"), rows
 
 
 _TABLES: dict[str, Callable[[], Listing]] = {

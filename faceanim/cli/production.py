@@ -67,6 +67,8 @@ class Production:
                 file.append(frame.points)
                 self.progress.advance()
         self.positions = np.load(path, mmap_mode="r")
+        for notice in getattr(session.solver, "notices", ()):
+            self.progress.note(f"{session.backend}: {notice}")
 
     def measure(self, *, trajectory: bool) -> None:
         """Measure errors against better runs, and whether the skin is sound in every frame."""

@@ -64,6 +64,13 @@ class Progress:
             self.note(f"{self._text}: {self._done}/{self._total}")
             self._spoke = perf_counter()
 
+    def hear(self, what: str, done: int, total: int) -> None:
+        """Show what a long computation tells (`ground.notes`) as a stage of its own."""
+        if (what, total) != (self._text, self._total):
+            self.stage(what, total)
+        while self._done < done:
+            self.advance()
+
     def detail(self, text: str) -> None:
         """Name the unit of work that is being done."""
         if self._bar is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
@@ -19,6 +19,7 @@ PARTS = ("simulation", "drawing")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `faceanim warmup`."""
     parser.add_argument("--quiet", action="store_true", help="no progress, only the closing line")
+    parser.add_argument("--backend", default="mass_spring", help="which one, or all (default: %(default)s)")
     parser.add_argument("--only", metavar="PART", help=f"one of {', '.join(PARTS)} (default: both, side by side)")
 
 
@@ -29,9 +30,14 @@ def run(args: argparse.Namespace) -> int:
 
     if args.only is not None and args.only not in PARTS:
         raise unknown_name("part", args.only, PARTS)
+    from faceanim.backends import BACKENDS
+
+    if args.backend not in (*BACKENDS, "all"):
+        raise unknown_name("backend", args.backend, [*BACKENDS, "all"])
+    backends = list(BACKENDS) if args.backend == "all" else [args.backend]
     start = perf_counter()
     with Progress(quiet=args.quiet) as progress, drawing_compiled(wait=args.only is None) as finish:
-        jobs = [] if args.only == "drawing" else _simulation()
+        jobs = [] if args.only == "drawing" else _simulation(backends)
         progress.stage("compiling", len(jobs) + 1)
         for text, job in jobs:
             progress.detail(text)
@@ -77,12 +83,12 @@ def drawing_compiled(*, wait: bool = True) -> Iterator[Callable[[], Any]]:
             helper.wait()
 
 
-def _simulation() -> list[tuple[str, Callable[[], Any]]]:
+def _simulation(backends: Sequence[str]) -> list[tuple[str, Callable[[], Any]]]:
     """Return what to run for the solvers, in order, each with a name."""
     from dataclasses import replace
     from functools import partial
 
-    from faceanim.backends import BACKENDS, backend_class
+    from faceanim.backends import backend_class
     from faceanim.expression.library import load_expression
     from faceanim.face.library import load_face
     from faceanim.session.session import Session
@@ -90,7 +96,7 @@ def _simulation() -> list[tuple[str, Callable[[], Any]]]:
     face = load_face(density="coarse")
     expression = load_expression("6+12+26")
     jobs: list[tuple[str, Callable[[], Any]]] = []
-    for name in BACKENDS:
+    for name in backends:
         options = backend_class(name).Options()
         kinds = [options]
         if hasattr(options, "adaptive"):

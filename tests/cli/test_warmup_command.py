@@ -58,7 +58,7 @@ def test_warming_up_marks_what_is_compiled(
 ) -> None:
     """Both parts run, progress goes to standard error, one closing line to standard output."""
     ran: list[str] = []
-    monkeypatch.setattr(warmup, "_simulation", lambda: [("steps", lambda: ran.append("steps"))])
+    monkeypatch.setattr(warmup, "_simulation", lambda backends: [("steps", lambda: ran.append("steps"))])
     monkeypatch.setattr(warmup, "_draw", lambda: ran.append("draw"))
     assert main(["warmup"]) == 0
     assert ran == ["steps", "draw"]
