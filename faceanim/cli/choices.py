@@ -46,7 +46,7 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--full", dest="adaptive", action="store_false", help="every vertex dynamic")
     group.add_argument("--tolerance", metavar="MM", help="what the adaptive partition may cost in accuracy [mm]")
     group.add_argument("--threads", metavar="N", help="processor cores to use (default: one to simulate, all to draw)")
-    group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[], 
+    group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[],
                        help="any other option of the backend (`faceanim info backends`)")  # fmt: skip
 
 

@@ -35,7 +35,7 @@ def _path(kind: str, key: str) -> Path:
 def load_arrays(kind: str, key: str) -> dict[str, np.ndarray] | None:
     """Return the arrays kept under `key` in the cache called `kind`, or None if there are none that can be read."""
     try:
-        with np.load(_path(kind, key), allow_pickle=False) as file:
+        with _path(kind, key).open("rb") as held, np.load(held, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
     except Exception:  # a damaged file raises whatever its damage provokes; it is as good as none
         return None
