@@ -182,6 +182,7 @@ def crumpled(body: Body, amount: float, seed: int = 3) -> np.ndarray:
     return body.surface.points + amount * np.random.default_rng(seed).standard_normal(body.surface.points.shape)
 
 
+DAMPING = {"damping": 2000.0, "stiffness_damping": 1e-3}
 FLESH = Material("flesh", 1.04e-6, 15.0, 0.4)
 
 
@@ -189,9 +190,9 @@ def bridge(cells: tuple[int, int, int] = (8, 3, 3), **changes: Any) -> Body:
     """Return a bar of flesh, 40 x 12 x 12 mm, between cranium (x = 0) and jaw (x = 40), with two muscles on its back."""
     mesh = box_tets(cells, (40.0, 12.0, 12.0))
     x = mesh.points[:, 0]
-    plain = solid_body(
-        mesh, FLESH, (x < 1e-9) | (x > 40.0 - 1e-9), bone=(x > 20.0).astype(int), bones=("cranium", "jaw")
-    )
+    held = (x < 1e-9) | (x > 40.0 - 1e-9)
+    bones = ("cranium", "jaw")
+    plain = solid_body(mesh, FLESH, held, bone=(x > 20.0).astype(int), bones=bones, **DAMPING)
     p = plain.surface.points
     top = np.flatnonzero((p[:, 1] > 11.9) & (np.abs(p[:, 0] - 20.0) < 11.0)).astype(np.int32)
     k, zeros = len(top), np.zeros(len(top), np.int32)
@@ -200,11 +201,11 @@ def bridge(cells: tuple[int, int, int] = (8, 3, 3), **changes: Any) -> Body:
         np.full(2 * k, 1.0 / k), np.repeat([PULL_TO_POINT, PULL_ALONG], k).astype(np.int32),
         np.repeat([[10.0, 40.0, 15.0], [0.0, 0.6, 0.8]], k, axis=0), np.zeros(2 * k, np.int32), np.ones(2 * k),
     )  # fmt: skip
-    return replace(plain, muscles=muscles, **({"damping": 2000.0, "stiffness_damping": 1e-3} | changes))
+    return replace(plain, muscles=muscles, **changes)
 
 
-def cantilever(cells: tuple[int, int, int] = (8, 2, 2), material: Material = FLESH, **changes: Any) -> Body:
+def cantilever(cells: tuple[int, int, int] = (12, 3, 3), material: Material = FLESH, **changes: Any) -> Body:
     """Return a bar of flesh, 40 x 10 x 10 mm, held at x = 0 alone."""
     mesh = box_tets(cells, (40.0, 10.0, 10.0))
-    body = solid_body(mesh, material, mesh.points[:, 0] < 1e-9)
-    return replace(body, **({"damping": 2000.0, "stiffness_damping": 1e-3} | changes))
+    body = solid_body(mesh, material, mesh.points[:, 0] < 1e-9, **DAMPING)
+    return replace(body, **changes)

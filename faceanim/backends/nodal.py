@@ -71,7 +71,7 @@ def push_out(points: Floats, body: Body) -> None:
     for ball in body.spheres:
         away = points[ball.node] - ball.centre
         distance = np.linalg.norm(away, axis=1)
-        wanted = ball.radius + ball.clearance
+        wanted = ball.radius + (ball.clearance if ball.thick_clearance is None else ball.thick_clearance)
         inside = (distance < wanted) & (distance > 1e-9)
         factor = (wanted[inside] / distance[inside])[:, None]
         points[ball.node[inside]] = ball.centre + away[inside] * factor

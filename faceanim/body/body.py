@@ -103,6 +103,7 @@ class SphereContact:
     """Vertices `node` (c,) kept at least `clearance` (c,) [mm] outside a fixed sphere (an eyeball).
 
     hardness : [-] factor on the body's contact stiffness
+    thick_clearance : (c,) [mm] the same where flesh has a volume: its inside and its outside must not meet; None = equal
     """
 
     name: str
@@ -111,6 +112,7 @@ class SphereContact:
     node: Ints
     clearance: Floats
     hardness: float = 1.0
+    thick_clearance: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +137,6 @@ class Body:
 
     mass : (n,) [kg]            membrane_modulus : (t,) [kPa mm], Young's modulus times thickness
     damping : [1/s], the force -damping * mass * v   pinned : (n,) carried rigidly by the bones (weights of `attachment`)
-    stiffness_damping : [s], the force -stiffness_damping * K v of a solid (Rayleigh's second coefficient)
     contact_stiffness : [mN/mm per mm^2], penalty pressure per depth
     volume : makes `solid` when it is first asked for, None = only the surface is known
     """
@@ -154,7 +155,6 @@ class Body:
     pairs: tuple[PairContact, ...] = ()
     contact_stiffness: float = 20.0
     labels: dict[str, Ints] = field(default_factory=dict)
-    stiffness_damping: float = 0.0
     volume: Callable[[], Solid] | None = None
 
     def __post_init__(self) -> None:

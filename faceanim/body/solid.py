@@ -26,6 +26,8 @@ class Solid:
     bone_weight : (n, n_bone) [-]; a node held by bones has a row that sums to 1 and goes where their weighted poses
     take it, a free node a row of zeros
     skin : the body's surface vertices as carried by the nodes
+    damping [1/s], stiffness_damping [s] : Rayleigh coefficients xi and zeta, the force -(xi M + zeta K) v; they stand
+    for those of the body, which are made for a sheet
     """
 
     mesh: TetMesh
@@ -33,6 +35,8 @@ class Solid:
     region: Ints
     bone_weight: Floats
     skin: Embedding
+    damping: float = 0.0
+    stiffness_damping: float = 0.0
 
     def __post_init__(self) -> None:
         e, n = len(self.mesh.tets), len(self.mesh.points)
@@ -108,7 +112,7 @@ def solid_body(
     materials = (material,) if isinstance(material, Material) else tuple(material)
     regions = np.zeros(len(mesh.tets), dtype=np.int32) if region is None else np.asarray(region, dtype=np.int32)
     node = mesh.boundary_nodes
-    solid = Solid(mesh, materials, regions, weight, Embedding.of_nodes(node))
+    solid = Solid(mesh, materials, regions, weight, Embedding.of_nodes(node), damping, stiffness_damping)
     surface = mesh.boundary
     young = np.array([m.young_modulus for m in materials])[regions]
     thickness = float(mesh.volumes.sum() / surface.areas.sum())
@@ -120,7 +124,6 @@ def solid_body(
         membrane_modulus=np.full(len(surface.triangles), float(np.average(young, weights=mesh.volumes)) * thickness),
         law=SpringLaw(),
         damping=damping,
-        stiffness_damping=stiffness_damping,
         pinned=holds[node],
         attachment=Attachment(anchored, np.zeros(len(node))),
         muscles=Muscles.none() if muscles is None else muscles,

@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     from faceanim.cli.production import Production
     from faceanim.cli.progress import Progress
     from faceanim.cli.warmup import drawing_compiled
-    from faceanim.ground.jit import cache_notice
+    from faceanim.ground.folders import cache_notice
     from faceanim.ground.notes import listening
     from faceanim.session.recording import Results
 

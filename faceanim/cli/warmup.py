@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run everything once on the coarse face; machine code does not depend on the density."""
     from faceanim.cli.progress import Progress
-    from faceanim.ground.jit import cache_notice
+    from faceanim.ground.folders import cache_notice
 
     if args.only is not None and args.only not in PARTS:
         raise unknown_name("part", args.only, PARTS)

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from faceanim.body.body import BoneContact, PairContact, SphereContact
 from faceanim.face.geodesic import distance_along, harmonic_field
-from faceanim.face.tissue import Hypodermis
+from faceanim.face.tissue import Contact, Hypodermis
 from faceanim.geometry.distance import DistanceGrid
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Bools, Floats, Ints
@@ -82,12 +82,13 @@ def bone_contact(
 
 
 def eyeball_contact(
-    points: Floats, name: str, centre: Floats, radius: float, clearance: float, hardness: float
+    points: Floats, name: str, centre: Floats, radius: float, contact: Contact, lid_thickness: float
 ) -> SphereContact:
-    """Return the contact of all skin within 5 mm of an eyeball with it."""
+    """Return the contact of all skin within 5 mm of an eyeball with it; nothing is in contact at rest."""
     gap = np.linalg.norm(points - centre, axis=1) - radius
     node = np.flatnonzero(gap < 5.0).astype(np.int32)
-    return SphereContact(name, centre, radius, node, np.minimum(clearance, 0.9 * np.maximum(gap[node], 0.0)), hardness)
+    clearance, thick = (np.minimum(c, 0.9 * np.maximum(gap[node], 0.0)) for c in (contact.eye_clearance, lid_thickness))
+    return SphereContact(name, centre, radius, node, clearance, contact.eye_hardness, thick)
 
 
 def pair_contact(mesh: TriMesh, name: str, upper: Ints, lower: Ints, reach: float, gap: float) -> PairContact:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from faceanim.body.body import Attachment, Body, Bone, Muscles
+from faceanim.body.solid import Solid
 from faceanim.face import attach
 from faceanim.face.attach import LID, LIP, MUCOSA, NECK, SCALP, SKIN
 from faceanim.face.geodesic import distance_along
@@ -214,7 +215,7 @@ class Face:
         return Attachment(self.bone_weight, stiffness, h.alpha, h.s0, shear, limit)
 
     def body(self) -> Body:
-        """Return this head as a body that any backend can move."""
+        """Return this head as a body that any backend can move; its volume is grown when it is first asked for."""
         t, mesh = self.tissue, self.mesh
         contact = t.contact
         modulus = np.full(len(mesh.triangles), t.membrane.young_modulus * t.membrane.thickness)
@@ -233,15 +234,19 @@ class Face:
             bones=(Bone("cranium", self.skull.cranium_grid), Bone("jaw", self.skull.jaw_grid)),
             bone_contact=self._bone_contact(),
             spheres=tuple(
-                attach.eyeball_contact(
-                    mesh.points, f"eye_{s}", e.centre, e.radius, contact.eye_clearance, contact.eye_hardness
-                )
+                attach.eyeball_contact(mesh.points, f"eye_{s}", e.centre, e.radius, contact, t.solid.lid_thickness)
                 for s, e in self.eyes.items()
             ),
             pairs=tuple(self._pairs()),
             contact_stiffness=contact.stiffness,
             labels={"region": self.region, "mirror": self.mirror},
+            volume=self._grown,
         )
+
+    def _grown(self) -> Solid:
+        from faceanim.face.tissue_volume import tissue_volume  # its cache loads the compiler
+
+        return tissue_volume(self)
 
     def _bone_contact(self) -> Any:
         movable = np.isin(self.region, (SKIN, LIP)) & ~self.pinned

@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from faceanim.ground.errors import AssetError
+from faceanim.tissue.material import Material
 from faceanim.tissue.spring_law import SpringLaw
 
 
@@ -71,6 +72,28 @@ class Contact(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap: float
 
 
+class Layer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One kind of flesh: young_modulus [kPa], poisson_ratio [-]."""
+
+    young_modulus: float
+    poisson_ratio: float
+
+
+class Flesh(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Soft tissue as a volume: density [kg/mm^3], damping [1/s] and stiffness_damping [s] of Rayleigh; lid_thickness
+    [mm] by which the outside of a lid is kept off the eyeball; four layers: skin, fat, muscle, and the moist gap between
+    lips or cheeks and teeth or gums."""
+
+    density: float
+    damping: float
+    stiffness_damping: float
+    lid_thickness: float
+    skin: Layer
+    fat: Layer
+    muscle: Layer
+    gap: Layer
+
+
 class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All soft-tissue constants of a head."""
 
@@ -79,6 +102,13 @@ class Tissue(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hypodermis: Hypodermis
     inertia: Inertia
     contact: Contact
+    solid: Flesh
+
+    def materials(self) -> tuple[Material, ...]:
+        """Return the materials of the volume, in the order of `tissue_volume`; raise `UserError` for impossible values."""
+        flesh = self.solid
+        layers = {"skin": flesh.skin, "fat": flesh.fat, "muscle": flesh.muscle, "gap": flesh.gap}
+        return tuple(Material(k, flesh.density, row.young_modulus, row.poisson_ratio) for k, row in layers.items())
 
     def law(self) -> SpringLaw:
         """Return the spring law of the skin."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from faceanim.ground.jit import user_cache, writable_folder
+from faceanim.ground.folders import user_cache, writable_folder
 
 
 def content_key(version: str, *parts: Any) -> str:

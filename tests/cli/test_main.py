@@ -138,7 +138,7 @@ def test_info_lists_what_there_is(topic: str, capsys: pytest.CaptureFixture[str]
 
 def test_a_cache_that_cannot_be_written_is_replaced_and_told() -> None:
     """Compiled code goes to a temporary folder instead, and a notice names both folders."""
-    code = "from faceanim.ground import jit; print(*jit.cache_notice())"
+    code = "import faceanim.ground.jit; from faceanim.ground import folders; print(*folders.cache_notice())"
     environment = {**os.environ, "FACEANIM_CACHE": os.devnull + "/cache"}
     environment.pop("NUMBA_CACHE_DIR", None)
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)

@@ -1,0 +1,1 @@
+"""Nonlinear finite elements on linear or quadratic tetrahedra: the reference by which the other backends are judged."""
