@@ -1,9 +1,9 @@
-"""A bar of soft tissue is twisted by half a turn and dragged about by its end: two constraints on one node.
+"""A bar, or a face by a corner of its mouth, is twisted and dragged: two constraints on one node of warped modes.
 
-    python docs/examples/twist_and_drag.py [folder]
+    python docs/examples/twist_and_drag.py [bar|face] [folder]
 
 Writes the frames, a film and a contact sheet; ends in the largest constraint residual: how far, as a share of the
-bar's length or in radians, the end was from where it was asked to be.
+body's width or in radians, the node was from where it was asked to be.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from faceanim.backends.modal_warping.solver import SolverModalWarping
 from faceanim.body.body import Body
 from faceanim.body.control import Control
 from faceanim.body.solid import solid_body
+from faceanim.face.library import load_face
 from faceanim.geometry.shapes import box_tets
 from faceanim.render.camera import Camera
-from faceanim.render.scene import head_scene
+from faceanim.render.scene import face_scene, head_scene
 from faceanim.render.sequence import Film, PngSequence, contact_sheet, write_png
+from faceanim.render.shading import Texture
 from faceanim.tissue.material import Material
 
 RATE = 30.0
@@ -63,19 +65,40 @@ def dragged(
         yield surface.copy(), solver.manipulation.position_residual, solver.manipulation.orientation_residual
 
 
-def path(frames: int, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return moves (frames, 3) [mm] and turns (frames, 3) [rad]: half a turn about x, then a drag, both eased."""
+def path(frames: int, move: Any, turn: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return moves (frames, 3) [mm] and turns (frames, 3) [rad]: first the whole `turn`, then the `move`, both eased."""
     s = np.clip(np.arange(1, frames + 1)[:, None] / frames * 2.0 - [[0.0, 1.0]], 0.0, 1.0)
     twist, drag = (s**2 * (3.0 - 2.0 * s)).T
-    moves = reach * drag[:, None] * np.array([-0.15, 0.3, 0.15])
-    return moves, twist[:, None] * np.array([np.pi, 0.0, 0.0])
+    return drag[:, None] * np.asarray(move), twist[:, None] * np.asarray(turn)
 
 
-def draw(body: Body, shapes: list[np.ndarray], out: Path, *, size: tuple[int, int] = (480, 360)) -> None:
+def bar_story(frames: int) -> tuple[Body, Any, list[Any]]:
+    """Return a bar, how to draw it, and what becomes of it: half a turn of its end, which is then dragged."""
+    body = soft_bar()
+    moves, turns = path(frames, (-15.0, 30.0, 15.0), (np.pi, 0.0, 0.0))
+    story = list(dragged(body, nearest_node(body, (100.0, 10.0, 10.0)), moves, turns))
+    surface, shapes = body.surface, [shape for shape, _, _ in story]
+    view = Camera.named("three_quarter", np.concatenate([surface.points, *shapes]), aspect=4 / 3)
+    scene = head_scene(surface.points, surface.triangles, size=(480, 360), view=view, mode="plain", wire=0.8)
+    return body, scene, story
+
+
+def face_story(frames: int) -> tuple[Body, Any, list[Any]]:
+    """Return a face, how to draw it, and what becomes of it: half a smile, pulled at a corner of the mouth."""
+    face = load_face()
+    body = face.body()
+    corner = face.mesh.points[face.landmarks["cheilion_left"]]
+    moves, turns = path(frames, (9.0, 7.0, -3.0), (0.0, 0.0, np.radians(12.0)))
+    story = list(dragged(body, nearest_node(body, corner), moves, turns, modes=120))
+    scene = face_scene(face, size=(420, 420), texture=Texture.of(face.texture))
+    return body, scene, story
+
+
+STORIES = {"bar": bar_story, "face": face_story}
+
+
+def draw(scene: Any, shapes: list[np.ndarray], out: Path, title: str) -> None:
     """Write frames, film and contact sheet of the surface at `shapes` into the folder `out`."""
-    everything = np.concatenate([body.surface.points, *shapes])
-    view = Camera.named("three_quarter", everything, aspect=size[0] / size[1])
-    scene = head_scene(body.surface.points, body.surface.triangles, size=size, view=view, mode="plain", wire=0.8)
     pictures = []
     frames = PngSequence(out / "frames", overwrite=True)
     with frames, Film(out / "twist_and_drag.mp4", RATE, overwrite=True) as film:
@@ -86,18 +109,19 @@ def draw(body: Body, shapes: list[np.ndarray], out: Path, *, size: tuple[int, in
             pictures.append(picture)
     chosen = np.linspace(0, len(pictures) - 1, 6).astype(int)
     rows = [[pictures[k] for k in chosen[:3]], [pictures[k] for k in chosen[3:]]]
-    write_png(out / "twist_and_drag.png", contact_sheet(rows, title="half a turn, then dragged by the end"))
+    write_png(out / "twist_and_drag.png", contact_sheet(rows, title=title))
 
 
-def main(out: str | Path, frames: int = 90) -> float:
+def main(out: str | Path, what: str = "bar", frames: int = 90) -> float:
     """Write the pictures into the folder `out` and return the largest constraint residual [-]."""
-    body = soft_bar()
+    body, scene, story = STORIES[what](frames)
+    draw(scene, [shape for shape, _, _ in story], Path(out), f"a {what}, twisted, then dragged")
     length = float(np.ptp(body.surface.points[:, 0]))
-    moves, turns = path(frames, length)
-    story = list(dragged(body, nearest_node(body, (100.0, 10.0, 10.0)), moves, turns))
-    draw(body, [surface for surface, _, _ in story], Path(out))
     return max(max(at / length, turn) for _, at, turn in story)
 
 
 if __name__ == "__main__":
-    print(f"largest constraint residual: {main(sys.argv[1] if len(sys.argv) > 1 else 'frames_twist'):.1e}")
+    asked = sys.argv[1] if len(sys.argv) > 1 else "bar"
+    if asked not in STORIES:
+        sys.exit(f"what to twist? one of {', '.join(STORIES)}")
+    print(f"largest constraint residual: {main(sys.argv[2] if len(sys.argv) > 2 else f'twisted_{asked}', asked):.1e}")

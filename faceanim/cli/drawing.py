@@ -125,7 +125,7 @@ def _values_of(session: Session, colour: str) -> Callable[[Floats], Any]:
         session.warm()
         partition = getattr(session.solver, "partition", None)
         if partition is None:
-            raise UserError("--colour sets shows the adaptive partition; leave out --full")
+            raise UserError("--colour sets shows the adaptive partition of backend mass_spring; leave out --full")
         sets = 2 - partition.node_set.astype(np.int64)
         return lambda _: sets
     return lambda _: None
