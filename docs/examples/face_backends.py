@@ -30,7 +30,9 @@ HEAD = (
 """Columns of the table."""
 
 
-def compare(density: str, backends: tuple[str, ...]) -> tuple[list[list[np.ndarray]], str, dict[tuple[str, str], float]]:
+def compare(
+    density: str, backends: tuple[str, ...]
+) -> tuple[list[list[np.ndarray]], str, dict[tuple[str, str], float]]:
     """Return pictures (a row for each expression), a Markdown table and the RMS distances from the reference [mm]."""
     face = load_face(density=density)
     body = face.body()
@@ -53,7 +55,9 @@ def compare(density: str, backends: tuple[str, ...]) -> tuple[list[list[np.ndarr
             error = field_error(shapes[backend], shapes[REFERENCE])
             rms[name, backend] = error.rms
             apart = "-" if backend == REFERENCE else f"{error.rms:.2f} / {error.max:.1f}"
-            table += f"| {name} | {backend} | {corner:.1f} | {lid:.1f} | {apart} | {preparation:.1f} | {equilibrium:.1f} |\n"
+            table += (
+                f"| {name} | {backend} | {corner:.1f} | {lid:.1f} | {apart} | {preparation:.1f} | {equilibrium:.1f} |\n"
+            )
         rows.append(pictures)
     return rows, table, rms
 
@@ -63,7 +67,11 @@ def main(out: str | Path, density: str = "default", backends: tuple[str, ...] = 
     rows, table, rms = compare(density, backends)
     folder = Path(out)
     columns = [[row[k] for row in rows] for k in range(len(backends))]
-    sheet = contact_sheet(columns, row_labels=[b.replace("_", " ") for b in backends], column_labels=[f"{name}, {share:g}" for name, share in EXPRESSIONS.items()])
+    sheet = contact_sheet(
+        columns,
+        row_labels=[b.replace("_", " ") for b in backends],
+        column_labels=[f"{name}, {share:g}" for name, share in EXPRESSIONS.items()],
+    )
     write_png(folder / "face_backends.png", sheet)
     (folder / "face_backends.md").write_text(table, encoding="utf-8")
     return rms["happiness", "modal_warping"]

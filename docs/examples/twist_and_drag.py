@@ -52,7 +52,7 @@ def dragged(
 
     moves : (frames, 3) from where it rests [mm]   turns : (frames, 3) rotation vectors [rad]
     """
-    solver = SolverModalWarping(body, Options(modes=modes))
+    solver = SolverModalWarping(body, Options(modes=modes, variant="consistent"))
     around = with_neighbours(solver, with_neighbours(solver, [node]))
     solver.manipulation = Manipulation(solver, position=[node], orientation=[node], exercised=around)
     rest = solver.solid.mesh.points[[node]]

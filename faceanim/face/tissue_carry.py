@@ -20,15 +20,18 @@ from faceanim.ground.arrays import Bools, Floats, Ints
 if TYPE_CHECKING:
     from faceanim.face.face import Face
 
-MOUTH_REACH = 3.5
-"""Skin inside the mouth that is farther from the flesh than this is carried by the bones [mm]."""
+MOUTH_DEPTH = (6.0, 18.0)
+"""Skin inside the mouth goes with the flesh up to the first distance from the lips, with the bones from the second [mm]."""
 _SUPPORT = 4.0
 """Depth of the node that carries skin lying outside every element, with the three above it [mm]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Carrier:
-    """Eight nodes and weights for each skin vertex, (n, 8), mostly four in use; `done` (n,) tells which are filled."""
+    """Twelve nodes and weights for each skin vertex, (n, 12): four in the flesh, then four for each of two bones.
+
+    done : (n,) which are filled
+    """
 
     node: Ints
     weight: Floats
@@ -54,38 +57,42 @@ def carry(
     """
     points = face.mesh.points
     n = len(points)
-    carrier = Carrier(np.zeros((n, 8), dtype=np.int32), np.zeros((n, 8)), np.zeros(n, dtype=bool))
+    carrier = Carrier(np.zeros((n, 12), dtype=np.int32), np.zeros((n, 12)), np.zeros(n, dtype=bool))
     wanted = (points[:, 0] >= 0.0) if half else np.ones(n, dtype=bool)
     inside = np.isin(face.region, (LIP, MUCOSA, LID))
     outer = np.flatnonzero(wanted & ~inside & ~face.pinned)
     _fill(carrier, outer, *_on_prisms(points[outer], columns, mesh, layers))
-    rigid = face.pinned & wanted
+    share = _bone_share(face)
+    rigid = (share >= 1.0) & wanted
     flaps = _flaps(face, columns, mesh, layers)
     for allowed, which in flaps:
         row = np.flatnonzero(wanted & inside & which & ~rigid)
         if len(row):
             _fill(carrier, row, *_on_elements(points[row], mesh, allowed))
-            far = face.region[row] == MUCOSA
-            far[far] = _outside(points[row[far]], mesh) > MOUTH_REACH
-            rigid[row[far]] = True
-    _carry_rigid(carrier, np.flatnonzero(rigid), face, mesh, bone_weight)
     if half:
         centre = (points[:, 0] == 0.0) & ~rigid
         _flatten(carrier, np.flatnonzero(centre & ~inside), points, mesh, np.ones(len(mesh.tets), dtype=bool))
         for allowed, which in flaps:
             _flatten(carrier, np.flatnonzero(centre & inside & which), points, mesh, allowed)
+    carrier.weight[wanted] *= 1.0 - share[wanted, None]
+    _carry_rigid(carrier, np.flatnonzero(wanted & (share > 0.0)), share, face, mesh, bone_weight)
     carrier.done[wanted] = True
     return carrier, rigid
 
 
 def _fill(carrier: Carrier, row: np.ndarray, node: Ints, weight: Floats) -> None:
     carrier.node[row, :4], carrier.weight[row, :4] = node, weight
-    carrier.node[row, 4:], carrier.weight[row, 4:] = node[:, :1], 0.0
 
 
-def _outside(points: Floats, mesh: TetMesh) -> Floats:
-    """Return how far each point lies from the boundary of the volume, (k,) [mm]."""
-    return point_distance(points, mesh.boundary)[0]
+def _bone_share(face: Face) -> Floats:
+    """Return how far the bones themselves carry each skin vertex, (n,) in [0, 1]: pinned skin, the depth of the mouth."""
+    lips = np.flatnonzero(face.region == LIP).astype(np.int32)
+    near, far = MOUTH_DEPTH
+    share = np.zeros(len(face.mesh.points))
+    if len(lips):
+        t = np.clip((distance_along(face.mesh, lips) - near) / (far - near), 0.0, 1.0)
+        share = np.where(face.region == MUCOSA, t * t * (3.0 - 2.0 * t), 0.0)
+    return np.where(face.pinned, 1.0, share)
 
 
 def _on_prisms(points: Floats, columns: Columns, mesh: TetMesh, layers: int) -> tuple[Ints, Floats]:
@@ -148,17 +155,20 @@ def _flaps(face: Face, columns: Columns, mesh: TetMesh, layers: int) -> list[tup
     return out
 
 
-def _carry_rigid(carrier: Carrier, row: np.ndarray, face: Face, mesh: TetMesh, bone_weight: Floats) -> None:
-    """Fill in the skin that bones carry: four distant nodes of each bone, blended as the bones are."""
+def _carry_rigid(
+    carrier: Carrier, row: np.ndarray, share: Floats, face: Face, mesh: TetMesh, bone_weight: Floats
+) -> None:
+    """Fill in what bones carry of the skin, `share` (n,): four distant nodes of each bone, blended as the bones are."""
     for bone in range(bone_weight.shape[1]):
         held = np.flatnonzero(bone_weight[:, bone] > 1.0 - 1e-12)
         if len(held) < 4:
             held = np.argsort(-bone_weight[:, bone], kind="stable")[:40].astype(np.int64)
         frame = held[_spread(mesh.points[held])]
         corner = np.broadcast_to(mesh.points[frame], (len(row), 4, 3))
-        part = slice(4 * bone, 4 * bone + 4)
+        part = slice(4 + 4 * bone, 8 + 4 * bone)
         carrier.node[row, part] = frame
-        carrier.weight[row, part] = face.bone_weight[row, bone, None] * four_weights(corner, face.mesh.points[row])
+        amount = (share * face.bone_weight[:, bone])[row, None]
+        carrier.weight[row, part] = amount * four_weights(corner, face.mesh.points[row])
 
 
 def _spread(points: Floats) -> Ints:

@@ -44,7 +44,9 @@ class Embedding:
         """Return the weights as a sparse (k, n) matrix B: points B x; nodal forces of the same work B^T f."""
         k, w = self.node.shape
         rows = np.repeat(np.arange(k), w)
-        return sparse.coo_matrix((self.weight.ravel(), (rows, self.node.ravel())), shape=(k, n)).tocsr()
+        matrix = sparse.coo_matrix((self.weight.ravel(), (rows, self.node.ravel())), shape=(k, n)).tocsr()
+        matrix.eliminate_zeros()
+        return matrix
 
 
 def barycentric(mesh: TetMesh, tets: Ints, points: Floats) -> Floats:

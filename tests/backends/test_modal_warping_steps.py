@@ -330,3 +330,19 @@ def test_a_guess_starts_the_search() -> None:
     np.testing.assert_allclose(again.q, state.q, rtol=1e-6, atol=1e-9)
     assert solver.static_report.iterations < first
     assert displaced(solver, again)[node_at(body, 1.0, 0.1, 0.1), 1] < -0.3
+
+
+def test_long_steps_are_stable_under_a_muscle_near_its_point() -> None:
+    """A pull that stiffens as its point comes near ends where statics say, at steps of a thirtieth of a second too."""
+    body = jawed_bar(damping=2000.0)
+    control = Control.rest(body)
+    control.activation[:] = 1.0
+    for variant in ("rotation_strain", "consistent", "linear"):
+        solver = solver_of(body, 12, variant)
+        expected, found = body.surface.points.copy(), body.surface.points.copy()
+        solver.surface(solver.solve_static(control), expected)
+        state = solver.rest()
+        for _ in range(150):
+            solver.step(state, state, control, 1.0 / 30.0)
+        solver.surface(state, found)
+        np.testing.assert_allclose(found, expected, atol=0.02)

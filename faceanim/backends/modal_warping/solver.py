@@ -10,7 +10,7 @@ import numpy as np
 
 from faceanim.backends.modal_warping.build import Modes, compute_modes, muscle_forces, with_held
 from faceanim.backends.modal_warping.display import SkinWarp
-from faceanim.backends.modal_warping.loads import Loads
+from faceanim.backends.modal_warping.loads import Loads, MuscleStiffness
 from faceanim.backends.modal_warping.manipulation import Manipulation
 from faceanim.backends.modal_warping.options import Options
 from faceanim.backends.modal_warping.recurrence import Recurrence, make_recurrence
@@ -65,6 +65,7 @@ class SolverModalWarping:
         self.damping = self.solid.damping + self.solid.stiffness_damping * self.modes.squared
         self.shape = make_shape(self.solid, self.modes, self.options.variant)
         self.loads = Loads(body, self.solid)
+        self._muscle_stiffness = MuscleStiffness(body, self.loads, self.modes.shapes())
         self.manipulation: Manipulation | None = None
         self.static_report = StepReport()
         self.notices: list[str] = []
@@ -153,6 +154,12 @@ class SolverModalWarping:
             force -= self._coriolis(state_in)
         move = self.recurrence(dt)
         q = move.a * state_in.q + move.b * state_in.qd + move.g * force
+        stiff = self._muscle_stiffness.at(control, self.loads.surface)
+        if stiff is not None:
+            system = np.eye(len(q)) + move.g[:, None] * stiff
+            give = stiff @ np.linalg.solve(system, q - state_in.q)
+            force -= give
+            q -= move.g * give
         qd = move.c * state_in.q + move.d * state_in.qd + move.e * force
         report = StepReport(iterations=1)
         between = perf_counter()
