@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import argparse
 import re
+import runpy
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -24,6 +26,7 @@ from faceanim.face.face import Face
 from faceanim.face.muscle_image import map_picture
 from faceanim.render.muscle_picture import muscle_image, muscle_views
 from faceanim.render.sequence import contact_sheet, write_png
+from faceanim.render.tissue_picture import draw_cut
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -126,11 +129,29 @@ def faithfulness(face: Face) -> str:
     return "\n".join(lines) + "\n"
 
 
+def gallery(face: Face) -> None:
+    """Run the scripts of docs/examples and write their pictures and the table of backends into docs/."""
+    with TemporaryDirectory() as scratch:
+        for name in ("bar_bending", "octree_block", "face_backends"):
+            print(f"{name}: {main_of(name)(scratch):.3g}")
+        for what in ("bar", "face"):
+            print(f"twist_and_drag {what}: {main_of('twist_and_drag')(scratch, what):.3g}")
+            (Path(scratch) / "twist_and_drag.png").replace(DOCS / f"twisted_{what}.png")
+        for made in (*Path(scratch).glob("*.png"), *Path(scratch).glob("*.md")):
+            (DOCS / made.name).write_bytes(made.read_bytes())
+    draw_cut(face, DOCS / "tissue_cut.png", place=6.0)
+
+
+def main_of(example: str) -> Any:
+    """Return the function `main` of a script in docs/examples."""
+    return runpy.run_path(str(DOCS / "examples" / f"{example}.py"))["main"]
+
+
 def insert_tables() -> None:
-    """Put docs/framerate.md and docs/faithfulness.md between their marks in README.md."""
+    """Put the tables of docs/ between their marks in README.md."""
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    for name in ("framerate", "faithfulness", "muscles"):
+    for name in ("framerate", "faithfulness", "muscles", "face_backends"):
         if not (DOCS / f"{name}.md").exists():
             continue
         table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
@@ -143,7 +164,7 @@ def insert_tables() -> None:
 def main() -> None:
     """Make everything, or what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("pictures", "muscles", "framerate", "faithfulness", "insert"))
+    parser.add_argument("--only", choices=("pictures", "muscles", "gallery", "framerate", "faithfulness", "insert"))
     only = parser.parse_args().only
     DOCS.mkdir(exist_ok=True)
     apex = Apex("default")
@@ -151,6 +172,8 @@ def main() -> None:
         pictures(apex)
     if only in (None, "muscles"):
         (DOCS / "muscles.md").write_text(muscle_images(apex.face), encoding="utf-8")
+    if only in (None, "gallery"):
+        gallery(apex.face)
     if only in (None, "faithfulness"):
         (DOCS / "faithfulness.md").write_text(faithfulness(apex.face), encoding="utf-8")
     if only in (None, "framerate"):
