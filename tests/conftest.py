@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+# Many small products: threads that wait for each other would make them several times slower. Read when NumPy starts.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 
 from faceanim.backends import BACKENDS

@@ -118,4 +118,14 @@ def _typed(text: str, default: Any, name: str) -> Any:
         return whole(text, f"--option {name}", -(10**9), 10**9)
     if isinstance(default, float):
         return number(text, f"--option {name}", -1e12, 1e12)
-    return text
+    if isinstance(default, tuple):
+        return tuple(whole(part, f"--option {name}", -(10**9), 10**9) for part in text.split(","))
+    return _numbers(text, name) if default is None else text
+
+
+def _numbers(text: str, name: str) -> Any:
+    """Return a number, a list of numbers (1,2,3) or a table of them (0,0,0;1,1,1)."""
+    rows = [[number(part, f"--option {name}", -1e12, 1e12) for part in row.split(",")] for row in text.split(";")]
+    if len(rows) > 1:
+        return rows
+    return rows[0] if len(rows[0]) > 1 else rows[0][0]

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from toys import toy_face
 
-from faceanim.cli.main import main
+from faceanim.cli.choices import solver_options
+from faceanim.cli.main import build_parser, main
 
 QUICK = ["--backend", "toy", "--size", "48", "--fps", "10", "--duration", "0.6"]
 
@@ -169,3 +170,19 @@ def test_unsound_skin_is_put_into_words() -> None:
         "skin lies 0.2 mm inside an eyeball",
         "lips cross by 1.2 mm",
     ]
+
+
+@pytest.mark.parametrize(
+    ("setting", "name", "value"),
+    [
+        ("cell_size=4.5", "cell_size", 4.5),
+        ("box=0,0,0;10,20,30", "box", [[0.0, 0.0, 0.0], [10.0, 20.0, 30.0]]),
+        ("cells=16", "cells", 16),
+        ("hard=yes", "hard", True),
+        ("rule=series", "rule", "series"),
+    ],
+)
+def test_options_of_a_backend_are_read_as_what_they_are(setting: str, name: str, value: object) -> None:
+    """Numbers, whole numbers, words, yes and no, and tables of numbers reach the backend's Options."""
+    args = build_parser("express").parse_args(["express", "blink", "--backend", "octree_mass_spring", "--option", setting])
+    assert getattr(solver_options(args), name) == value
