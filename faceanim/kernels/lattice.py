@@ -65,6 +65,19 @@ class LatticeCells(NamedTuple):
     side: Floats
 
 
+class LatticeBarrier(NamedTuple):
+    """What keeps these cubes from turning inside out.
+
+    A corner whose Jacobian J is below `least` has the energy `strength` (c,) [uJ] * (least - J)^2 / 2: none near rest,
+    finite for an inverted one. near (c,): the first `listed[0]` are the cubes that `barrier_force` looks at, see `watch`
+    """
+
+    strength: Floats
+    least: float
+    near: Ints
+    listed: Ints
+
+
 class LatticeTables(NamedTuple):
     """All that acts on the nodes."""
 
@@ -73,6 +86,7 @@ class LatticeTables(NamedTuple):
     slaves: LatticeSlaves
     hexes: LatticeHexes
     cells: LatticeCells
+    barrier: LatticeBarrier
 
 
 SIGNS = np.array(
@@ -400,6 +414,87 @@ def corner_volumes(x, cells, out):
 
 
 @kernel
+def watch(x, cells, barrier, margin, out):
+    """Write `corner_volumes` into `out` (c,), and list the cubes below `barrier.least` + `margin` in `barrier.near`."""
+    corner_volumes(x, cells, out)
+    count = 0
+    for c in range(len(cells.side)):
+        if out[c] < barrier.least + margin and barrier.strength[c] > 0.0:
+            barrier.near[count] = c
+            count += 1
+    barrier.listed[0] = count
+
+
+@kernel(inline=True)
+def _corner_slopes(x, cells, c, n, g):
+    """Write dJ/dx of the three corners beside corner `n` of cube `c` (`n` ^ 4, ^ 2, ^ 1) into `g` (3, 3), return J."""
+    p = cells.corner[c, n]
+    scale = -SIGNS[n, 0] * SIGNS[n, 1] * SIGNS[n, 2] / cells.side[c] ** 3
+    a, b, d = cells.corner[c, n ^ 4], cells.corner[c, n ^ 2], cells.corner[c, n ^ 1]
+    ax, ay, az = x[a, 0] - x[p, 0], x[a, 1] - x[p, 1], x[a, 2] - x[p, 2]
+    bx, by, bz = x[b, 0] - x[p, 0], x[b, 1] - x[p, 1], x[b, 2] - x[p, 2]
+    dx, dy, dz = x[d, 0] - x[p, 0], x[d, 1] - x[p, 1], x[d, 2] - x[p, 2]
+    g[0, 0] = scale * (by * dz - bz * dy)
+    g[0, 1] = scale * (bz * dx - bx * dz)
+    g[0, 2] = scale * (bx * dy - by * dx)
+    g[1, 0] = scale * (dy * az - dz * ay)
+    g[1, 1] = scale * (dz * ax - dx * az)
+    g[1, 2] = scale * (dx * ay - dy * ax)
+    g[2, 0] = scale * (ay * bz - az * by)
+    g[2, 1] = scale * (az * bx - ax * bz)
+    g[2, 2] = scale * (ax * by - ay * bx)
+    return ax * g[0, 0] + ay * g[0, 1] + az * g[0, 2]
+
+
+@kernel
+def barrier_force(x, cells, barrier, force):
+    """Add the forces of the corners below `barrier.least` in the cubes `barrier.near` to `force` (n, 3)."""
+    g = np.empty((3, 3))
+    for k in range(barrier.listed[0]):
+        c = barrier.near[k]
+        for n in range(8):
+            short = barrier.least - _corner_slopes(x, cells, c, n, g)
+            if short > 0.0:
+                f = barrier.strength[c] * short
+                p = cells.corner[c, n]
+                for e in range(3):
+                    q = cells.corner[c, n ^ (4 >> e)]
+                    for d in range(3):
+                        force[q, d] += f * g[e, d]
+                        force[p, d] -= f * g[e, d]
+
+
+@kernel
+def barrier_energy(x, cells, barrier):
+    """Return the energy of all corners below `barrier.least` [uJ]."""
+    g = np.empty((3, 3))
+    total = 0.0
+    for c in range(len(cells.side)):
+        for n in range(8):
+            short = max(barrier.least - _corner_slopes(x, cells, c, n, g), 0.0)
+            total += 0.5 * barrier.strength[c] * short * short
+    return total
+
+
+@kernel
+def barrier_slopes(x, cells, barrier, node, slope, weight):
+    """Write of every corner of `barrier.near`: nodes (k, 4), dJ/dx (k, 4, 3), and the barrier or 0 if it has none (k,)."""
+    g = np.empty((3, 3))
+    for k in range(barrier.listed[0]):
+        c = barrier.near[k]
+        for n in range(8):
+            row = 8 * k + n
+            weight[row] = barrier.strength[c] if _corner_slopes(x, cells, c, n, g) < barrier.least else 0.0
+            node[row, 3] = cells.corner[c, n]
+            for d in range(3):
+                slope[row, 3, d] = -g[0, d] - g[1, d] - g[2, d]
+            for e in range(3):
+                node[row, e] = cells.corner[c, n ^ (4 >> e)]
+                for d in range(3):
+                    slope[row, e, d] = g[e, d]
+
+
+@kernel
 def reach(x, v, force, inverse_mass, dt, cells, out):
     """Write how far the farthest corner of every cube goes in `dt`, |v dt + f dt^2 / m| / side, into `out` (c,)."""
     for c in range(len(cells.side)):
@@ -426,6 +521,8 @@ def all_forces(x, load, tables, target, force):
         tie_force(x, tables.ties, target, force)
     if len(tables.hexes.side):
         hex_force(x, tables.hexes, force)
+    if tables.barrier.listed[0]:
+        barrier_force(x, tables.cells, tables.barrier, force)
     slaves = tables.slaves
     for s in range(len(slaves.node)):
         n = slaves.node[s]

@@ -184,5 +184,7 @@ def test_unsound_skin_is_put_into_words() -> None:
 )
 def test_options_of_a_backend_are_read_as_what_they_are(setting: str, name: str, value: object) -> None:
     """Numbers, whole numbers, words, yes and no, and tables of numbers reach the backend's Options."""
-    args = build_parser("express").parse_args(["express", "blink", "--backend", "octree_mass_spring", "--option", setting])
+    args = build_parser("express").parse_args(
+        ["express", "blink", "--backend", "octree_mass_spring", "--option", setting]
+    )
     assert getattr(solver_options(args), name) == value

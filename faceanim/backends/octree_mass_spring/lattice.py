@@ -18,6 +18,7 @@ class Lattice:
 
     stiffness : (c,) [mN/mm] of a leaf's whole edge, E h / simplify.YOUNG   mass : (c,) [kg]
     rule, chain : how many cells become one, see `Options`
+    barrier, least : [-] what resists a corner Jacobian below `least`, in the cell's modulus times its volume
     low, high : [-] the share of its rest length between which a spring is linear   ramp : [-] stiffness factor outside
     """
 
@@ -29,6 +30,8 @@ class Lattice:
     low: float = 0.3
     high: float = 1.7
     ramp: float = 100.0
+    barrier: float = 0.0
+    least: float = 0.5
     _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
     _cubes: dict[int, Floats] = field(default_factory=dict, repr=False)
 

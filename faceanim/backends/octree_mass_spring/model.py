@@ -7,15 +7,18 @@ from typing import Any
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import eigh
 from scipy.sparse.linalg import eigsh
 
 from faceanim.backends.octree_mass_spring import harmonic
+from faceanim.backends.octree_mass_spring.direct import factored
 from faceanim.backends.octree_mass_spring.lattice import Lattice
-from faceanim.backends.octree_mass_spring.simplify import PAIRS
+from faceanim.backends.octree_mass_spring.simplify import PAIRS, YOUNG
 from faceanim.geometry.octree import Octree
 from faceanim.ground.arrays import Floats, Ints
 from faceanim.kernels import lattice as kernels
 from faceanim.kernels.lattice import (
+    LatticeBarrier,
     LatticeCells,
     LatticeHexes,
     LatticeSlaves,
@@ -102,7 +105,20 @@ class Model:
         if len(t.ties.stiffness):
             w = self.tie_matrix()
             total = total + sparse.kron(w.T @ sparse.diags(t.ties.stiffness) @ w, sparse.identity(3))
+        if t.barrier.listed[0]:
+            total = total + self._barrier_at(x)
         return total.tocsc()
+
+    def _barrier_at(self, x: Floats) -> sparse.csr_matrix:
+        """Return the stiffness of the barriers near `x` (n, 3) without the part that may be negative, (3n, 3n)."""
+        cells, barrier = self.tables.cells, self.tables.barrier
+        k = 8 * int(barrier.listed[0])
+        node, slope, weight = np.zeros((k, 4), np.int32), np.zeros((k, 4, 3)), np.zeros(k)
+        kernels.barrier_slopes(x, cells, barrier, node, slope, weight)
+        columns = (3 * node[:, :, None] + np.arange(3)).reshape(k, 12)
+        rows = np.repeat(np.arange(k), 12)
+        g = sparse.csr_matrix((slope.ravel(), (rows, columns.ravel())), shape=(k, 3 * len(self.points)))
+        return (g.T @ sparse.diags(weight) @ g).tocsr()
 
     def tie_matrix(self) -> sparse.csr_matrix:
         """Return the weights of all ties, (t, n)."""
@@ -111,20 +127,45 @@ class Model:
         shape = (len(ties.stiffness), len(self.points))
         return sparse.csr_matrix((ties.weight.ravel(), (rows, ties.node.ravel())), shape=shape)
 
-    def largest_step(self) -> float:
-        """Return the largest stable step of symplectic Euler at rest [s], 2 / sqrt(largest eigenvalue of M^-1 K)."""
+    def largest_step(self, drag: float = 0.0) -> float:
+        """Return the largest stable step of symplectic Euler at rest [s], 2 / w, w^2 the largest eigenvalue of M^-1 K.
+
+        With a drag [1/s], implicit in the velocity, it is longer: (w dt)^2 = 4 + 2 drag dt.
+        """
+        if not self.free_mask().any():
+            return np.inf
+        square = self._largest_square()
+        return float((drag + np.sqrt(drag**2 + 4.0 * square)) / square)
+
+    def slowest(self) -> float:
+        """Return the angular frequency [1/s] of the lowest vibration at rest: inverse iteration from the rigid movements."""
         free = self.free_mask()
         if not free.any():
             return np.inf
+        lift = sparse.kron(self.reduce[:, free], sparse.identity(3)).tocsr()
+        k = (lift.T @ self.stiffness_at(self.points) @ lift).tocsc()
+        mass = np.repeat(self.mass[free], 3)
+        solved = factored(k + 1e-12 * float(k.diagonal().max()) * sparse.identity(k.shape[0], format="csc"))
+        x, lowest = np.tile(np.eye(3), (int(free.sum()), 1)), np.inf
+        for _ in range(8):
+            x = solved(mass[:, None] * x)
+            x /= np.linalg.norm(x, axis=0)
+            value = eigh(x.T @ (k @ x), x.T @ (mass[:, None] * x), eigvals_only=True)
+            lowest = float(max(value[0], 0.0))
+        return float(np.sqrt(lowest))
+
+    def _largest_square(self) -> float:
+        """Return the largest eigenvalue of M^-1 K at rest [1/s^2]."""
+        free = self.free_mask()
         lift = sparse.kron(self.reduce[:, free], sparse.identity(3)).tocsr()
         k = (lift.T @ self.stiffness_at(self.points) @ lift).tocsr()
         scale = sparse.diags(1.0 / np.sqrt(np.repeat(self.mass[free], 3)))
         a = (scale @ k @ scale).tocsr()
         if a.shape[0] < 40:
-            return float(2.0 / np.sqrt(np.linalg.eigvalsh(a.toarray())[-1]))
+            return float(np.linalg.eigvalsh(a.toarray())[-1])
         start = np.random.default_rng(0).standard_normal(a.shape[0])
         top = eigsh(a, k=1, which="LA", return_eigenvectors=False, v0=start, tol=1e-4)
-        return float(2.0 / np.sqrt(top[0]))
+        return float(top[0])
 
     def least_volume(self, x: Floats) -> Floats:
         """Return the smallest corner Jacobian of every active cell at `x` (n, 3), (a,) [-]; 1 at rest."""
@@ -191,7 +232,7 @@ def assemble(
     model = Model(
         lattice, level, nodes.of_leaf, nodes.cell_level, nodes.cell, nodes.corner, points, mass, own,
         np.flatnonzero(carrier >= 0).astype(np.int32), carrier[carrier >= 0].astype(np.int32),
-        _no_tables(springs, nodes), sparse.identity(len(points), format="csr"),
+        _no_tables(lattice, springs, nodes), sparse.identity(len(points), format="csr"),
     )  # fmt: skip
     masters, weight = model.embed(nodes.a_leaf[parent], points[hanging])
     tables, reduce = model.tables._replace(hexes=_hexes(lattice, nodes)), model.reduce
@@ -208,8 +249,8 @@ def assemble(
     return Model(**values)
 
 
-def tied(model: Model, held: Points, stiffness: float) -> tuple[Model, Ints]:
-    """Return `model` with ties [mN/mm] to the held points that its carried nodes do not move, and which points these are."""
+def tied(model: Model, held: Points, stiffness: Floats) -> tuple[Model, Ints]:
+    """Return `model` with ties of `stiffness` (p,) [mN/mm] to the held points that are loose, and which these are."""
     node, weight = model.embed(held.leaf, held.place)
     is_carried = np.zeros(len(model.points), dtype=bool)
     is_carried[model.carried] = True
@@ -220,7 +261,7 @@ def tied(model: Model, held: Points, stiffness: float) -> tuple[Model, Ints]:
     ties = LatticeTies(
         np.concatenate([old.node, np.pad(node[loose], ((0, 0), (0, 1)))]).astype(np.int32),
         np.concatenate([old.weight, np.pad(weight[loose], ((0, 0), (0, 1)))]),
-        np.concatenate([old.stiffness, np.full(len(loose), stiffness)]),
+        np.concatenate([old.stiffness, stiffness[loose]]),
     )
     return Model(**{**model.__dict__, "tables": model.tables._replace(ties=ties)}), loose
 
@@ -293,15 +334,23 @@ class _Nodes:
         return found.astype(np.int32), (best[found] % len(self.cell)).astype(np.int32)
 
 
-def _no_tables(springs: LatticeSprings, nodes: _Nodes) -> LatticeTables:
+def _no_tables(lattice: Lattice, springs: LatticeSprings, nodes: _Nodes) -> LatticeTables:
     none = np.zeros(0, dtype=np.int32)
     side = nodes.tree.leaves.side * np.left_shift(1, nodes.cell_level).astype(np.float64)
     return LatticeTables(
         springs, LatticeTies(np.zeros((0, 9), np.int32), np.zeros((0, 9)), np.zeros(0)),
         LatticeSlaves(none, np.zeros(1, np.int32), none, np.zeros(0)),
         LatticeHexes(np.zeros((0, 8), np.int32), np.zeros((0, 24, 24)), np.zeros(0)),
-        LatticeCells(nodes.corner, side),
+        LatticeCells(nodes.corner, side), _barrier(lattice, nodes),
     )  # fmt: skip
+
+
+def _barrier(lattice: Lattice, nodes: _Nodes) -> LatticeBarrier:
+    """Return the barriers of all active cells: `Lattice.barrier` E volume / 8 at each corner."""
+    leaf = 0.125 * lattice.barrier * YOUNG * lattice.stiffness * lattice.tree.leaves.side**2
+    count = len(nodes.cell)
+    strength: Floats = np.bincount(nodes.of_leaf, leaf, count).astype(np.float64)
+    return LatticeBarrier(strength, float(lattice.least), np.zeros(count, np.int32), np.zeros(1, np.int32))
 
 
 def _springs(lattice: Lattice, nodes: _Nodes) -> LatticeSprings:

@@ -15,12 +15,14 @@ from faceanim.body.control import Control
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.kernels import lattice as kernels
 
-CHUNK = 8
+CHUNK = 4
 """Steps between two looks at muscles, volumes and lengths."""
-HALVINGS = 6
+HALVINGS = 2
 """How often a step that inverts a cell is tried again with half the length."""
 MARGIN = 0.05
 """Share of a spring's linear range, at its ends, within which steps are already as short as beyond it."""
+AHEAD = 0.1
+"""How far above its barrier a cell's smallest Jacobian counts as near it."""
 SLOW = 0.1
 """Largest movement of a node in one step, in sides of the smallest cell, once nothing else helps."""
 
@@ -81,7 +83,7 @@ class Motion:
         """Return the cells whose corners may go farther in a step than beta times their current margin (4.4)."""
         room, tables = rig.room, rig.model.tables
         h = min(dt, self.options.safety * rig.dt_max)
-        load = rig.load(moment.control, x)[0]
+        load = rig.load(moment.control, x)
         held = moment.held_before + done * (moment.held_after - moment.held_before)
         kernels.all_forces(x, load, tables, rig.targets(held), room.force)
         kernels.corner_volumes(x, tables.cells, room.volume)
@@ -111,14 +113,15 @@ class Motion:
         """
         room, tables = rig.room, rig.model.tables
         room.x_before[:], room.v_before[:] = x, v
-        load = rig.load(moment.control, x)[0]
-        kernels.corner_volumes(x, tables.cells, room.volume)
+        load = rig.load(moment.control, x)
+        inverse_mass = rig.lag(moment.control, x, share * dt)
+        kernels.watch(x, tables.cells, tables.barrier, AHEAD, room.volume)
         already = room.volume <= 0.0
         strained = tables.springs.ramp > 1.0 and kernels.outside(x, tables.springs, MARGIN) > 0
         finer = int(np.ceil(np.sqrt(tables.springs.ramp))) if strained else 1
         fresh = already
         for _ in range(HALVINGS):
-            self._advance(rig, x, v, load, moment, dt, done, share, count * finer, np.inf)
+            self._advance(rig, x, v, load, inverse_mass, moment, dt, done, share, count * finer, np.inf)
             kernels.corner_volumes(x, tables.cells, room.volume)
             fresh = ~(room.volume > 0.0) & ~already
             beyond = not strained and tables.springs.ramp > 1.0 and kernels.outside(x, tables.springs, 0.0) > 0
@@ -127,7 +130,9 @@ class Motion:
             finer = finer * 2 if strained else max(2 * finer, int(np.ceil(np.sqrt(tables.springs.ramp))))
             strained = True
             x[:], v[:] = room.x_before, room.v_before
-        self._advance(rig, x, v, load, moment, dt, done, share, count * finer, SLOW * float(tables.cells.side.min()))
+        self._advance(
+            rig, x, v, load, inverse_mass, moment, dt, done, share, count * finer, SLOW * float(tables.cells.side.min())
+        )
         if not self.options.dynamic:
             self.notice(
                 "a load turned cells inside out; movements were limited: lower it, or use larger or dynamic cells"
@@ -137,14 +142,14 @@ class Motion:
         return count * finer, fresh if fresh.any() else None
 
     def _advance(
-        self, rig: Rig, x: Floats, v: Floats, load: Floats, moment: Moment, dt: float, done: float, share: float,
-        count: int, limit: float,
+        self, rig: Rig, x: Floats, v: Floats, load: Floats, inverse_mass: Floats, moment: Moment, dt: float, done: float,
+        share: float, count: int, limit: float,
     ) -> None:  # fmt: skip
         model = rig.model
         way = moment.held_after - moment.held_before
         goal = (moment.held_before + (done + share) * way)[model.carried_by]
         target = rig.targets(moment.held_before + done * way)
         kernels.advance(
-            x, v, load, model.tables, rig.inverse_mass, model.carried, (goal - x[model.carried]) / count, target,
+            x, v, load, model.tables, inverse_mass, model.carried, (goal - x[model.carried]) / count, target,
             rig.targets(way) * (share / count), share * dt / count, moment.drag, limit, count, rig.room.force,
         )  # fmt: skip

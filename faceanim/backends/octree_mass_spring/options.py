@@ -37,11 +37,14 @@ class Options:
     hold : [-] stiffness of the ties to bones, in fine edges, where bones do not carry nodes exactly
     floor : [-] least share to which a partly filled leaf counts as filled
     low, high : [-] of its rest length between which a spring is linear   ramp : [-] stiffness factor outside
+    film : [-] elements softer than this share of the body's mean modulus join no cells: between lips and teeth flesh slides
+    barrier : [-] resistance of a cell to turning inside out, in its modulus: where a corner Jacobian J is below `least`,
+        the energy density barrier * E (least - J)^2 / 2; none near rest, and 0 = none at all
     safety : [-] share of the largest stable step that is used
     static_tolerance : [-] unbalanced force of an equilibrium, as a share of the largest force   static_most : cap of steps
     """
 
-    cells: int = 12
+    cells: int = 24
     cell_size: float | None = None
     levels: int = 4
     cut: str = "uniform"
@@ -60,7 +63,10 @@ class Options:
     floor: float = 0.1
     low: float = 0.3
     high: float = 1.7
-    ramp: float = 100.0
+    ramp: float = 4.0
+    film: float = 0.05
+    barrier: float = 5.0
+    least: float = 0.5
     safety: float = 0.8
     static_tolerance: float = 1e-10
     static_most: int = 200
@@ -90,6 +96,9 @@ class Options:
             ("low", 0 < self.low < 1, "between 0 and 1"),
             ("high", self.high > 1, "above 1"),
             ("ramp", self.ramp >= 1, "at least 1"),
+            ("film", 0 <= self.film < 1, "in 0..1"),
+            ("barrier", self.barrier >= 0, "not negative"),
+            ("least", 0 < self.least < 1, "between 0 and 1"),
             ("safety", 0 < self.safety < 1, "between 0 and 1"),
             ("static_tolerance", self.static_tolerance > 0, "positive"),
         ):

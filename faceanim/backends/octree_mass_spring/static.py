@@ -38,6 +38,7 @@ def inner_energy(model: Model, x: Floats, target: Floats) -> float:
         kernels.spring_energy(x, tables.springs)
         + kernels.hex_energy(x, tables.hexes)
         + kernels.tie_energy(x, tables.ties, target)
+        + kernels.barrier_energy(x, tables.cells, tables.barrier)
     )
 
 
@@ -90,12 +91,15 @@ class _Search:
         self.lift = sparse.kron(model.reduce[:, free], sparse.identity(3)).tocsr()
         self.outer = 0.0
         self._force = np.zeros_like(model.points)
+        self._volume = np.zeros(len(model.corner))
 
     def at(self, x: Floats) -> tuple[float, Floats]:
         """Return the energy and the forces on the free nodes, (m, 3)."""
         outer, potential = self.load(x)
         self.outer = float(np.abs(outer).max(initial=0.0))
-        kernels.all_forces(x, outer, self.model.tables, self.target, self._force)
+        tables = self.model.tables
+        kernels.watch(x, tables.cells, tables.barrier, 0.0, self._volume)
+        kernels.all_forces(x, outer, tables, self.target, self._force)
         return inner_energy(self.model, x, self.target) + potential, self._force[self.free]
 
     def rounding(self, x: Floats) -> float:
