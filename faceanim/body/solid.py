@@ -11,6 +11,7 @@ import numpy as np
 
 from faceanim.body.body import Attachment, Body, Bone, Muscles
 from faceanim.geometry.embedding import Embedding
+from faceanim.geometry.surface import TriMesh
 from faceanim.geometry.volume import TetMesh
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
@@ -95,37 +96,41 @@ def solid_body(
     damping: float = 0.0,
     stiffness_damping: float = 0.0,
     muscles: Muscles | None = None,
+    surface: TriMesh | None = None,
+    skin: Embedding | None = None,
 ) -> Body:
-    """Return a body made of flesh alone: its surface is the boundary of `mesh`.
+    """Return a body made of flesh alone: its surface is the boundary of `mesh`, or what it carries.
 
     held : (n,) bool or node indices held by a bone   bone : which one, a number or (n,), index into `bones`
     region : (e,) index into the materials (default: all 0)
     damping, stiffness_damping : Rayleigh coefficients xi [1/s] and zeta [s]
+    surface, skin : another surface and its vertices as carried by the nodes (see `geometry.filling.filled`)
     Raises `UserError` for elements that are inverted or flat.
     """
     mesh.reject_bad()
     n = len(mesh.points)
     holds = np.zeros(n, dtype=bool)
-    holds[np.asarray(held)] = True
+    which = np.asarray(held)
+    holds[which if which.dtype == bool else which.astype(np.int64)] = True
     weight = np.zeros((n, len(bones)))
     weight[holds, np.broadcast_to(np.asarray(bone), (n,))[holds]] = 1.0
     materials = (material,) if isinstance(material, Material) else tuple(material)
     regions = np.zeros(len(mesh.tets), dtype=np.int32) if region is None else np.asarray(region, dtype=np.int32)
-    node = mesh.boundary_nodes
-    solid = Solid(mesh, materials, regions, weight, Embedding.of_nodes(node), damping, stiffness_damping)
-    surface = mesh.boundary
+    if surface is None or skin is None:
+        surface, skin = mesh.boundary, Embedding.of_nodes(mesh.boundary_nodes)
+    solid = Solid(mesh, materials, regions, weight, skin, damping, stiffness_damping)
     young = np.array([m.young_modulus for m in materials])[regions]
     thickness = float(mesh.volumes.sum() / surface.areas.sum())
-    anchored = weight[node].copy()
-    anchored[~holds[node], 0] = 1.0
+    pinned = (holds[skin.node] | (skin.weight == 0.0)).all(axis=1)
+    anchored = np.where(pinned[:, None], skin.apply(weight), np.eye(len(bones))[0])
     return Body(
         surface=surface,
-        mass=solid.node_mass[node],
+        mass=surface.vertex_areas / surface.areas.sum() * solid.node_mass.sum(),
         membrane_modulus=np.full(len(surface.triangles), float(np.average(young, weights=mesh.volumes)) * thickness),
         law=SpringLaw(),
         damping=damping,
-        pinned=holds[node],
-        attachment=Attachment(anchored, np.zeros(len(node))),
+        pinned=pinned,
+        attachment=Attachment(anchored, np.zeros(len(pinned))),
         muscles=Muscles.none() if muscles is None else muscles,
         bones=tuple(Bone(name) for name in bones),
         volume=lambda: solid,
