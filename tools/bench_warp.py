@@ -7,6 +7,7 @@ each way once, so that a busy machine slows all of them alike. The results are c
 
   product     u, w = P q in float64 by NumPy, nothing else         numpy    the same, then Rt(w) u by NumPy
   blocks      float32 in blocks, one thread                        blocks 2 the same, two threads
+  compact     16 bits in blocks, one thread
   nodes       nodes warped in blocks, one thread, vertices as means of four nodes
 """
 
@@ -45,6 +46,7 @@ class Case:
         self.q = 0.5 * random.standard_normal(modes)
         self.flat = np.ascontiguousarray(basis.reshape(vertices, 2, 3, modes).transpose(1, 0, 2, 3).reshape(-1, modes))
         self.one, self.two = BlockWarp(self.rest, basis), BlockWarp(self.rest, basis, threads=2)
+        self.compact = BlockWarp(self.rest, basis, compact=True)
         self.nodes = BlockWarp(self.rest[:nodes], basis[:nodes])
         self.node = random.integers(0, nodes, (vertices, 4)).astype(np.int32)
         # neighbours in space are neighbours in number, as in a sorted mesh
@@ -66,14 +68,16 @@ class Case:
             "numpy": lambda: numpy_warp(self.rest, self.flat, self.q),
             "blocks": lambda: self.one.points(self.q),
             "blocks 2": lambda: self.two.points(self.q),
+            "compact": lambda: self.compact.points(self.q),
             "nodes": self.by_nodes,
         }
 
-    def error(self) -> float:
-        """Return the largest difference of the blocks from float64, relative to the largest displacement."""
+    def errors(self) -> tuple[float, float]:
+        """Return the largest difference of float32 and of 16 bits from float64, relative to the largest displacement."""
         exact = numpy_warp(self.rest, self.flat, self.q)
         size = np.abs(exact - self.rest).max()
-        return float(max(np.abs(w.points(self.q) - exact).max() for w in (self.one, self.two)) / size)
+        one, two, compact = (np.abs(w.points(self.q) - exact).max() / size for w in (self.one, self.two, self.compact))
+        return float(max(one, two)), float(compact)
 
     def times(self, rounds: int) -> dict[str, np.ndarray]:
         """Return the times (rounds,) [s] of each way, run in turn."""
@@ -98,7 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=1883)
     chosen = parser.parse_args(arguments)
     case = Case(chosen.vertices, chosen.modes, chosen.nodes)
-    print(f"{chosen.vertices} vertices, {chosen.modes} modes, {chosen.nodes} nodes; float32 error {case.error():.1e}")
+    single, compact = case.errors()
+    print(f"{chosen.vertices} vertices, {chosen.modes} modes, {chosen.nodes} nodes")
+    print(f"largest error over largest displacement: float32 {single:.1e}, 16 bits {compact:.1e}")
     times = case.times(chosen.rounds)
     least, middle = times["product"].min(), np.median(times["product"])
     print(f"{'way':<10}{'min ms':>9}{'ratio':>8}{'median ms':>11}{'ratio':>8}")

@@ -152,8 +152,8 @@ def coriolis(moved, rate, out):
 
 
 @kernel(inline=True)
-def _gather(table, block, z, count, acc):
-    """Put the amplitudes' sum over one block into `acc` (6, LANES), four columns at a time."""
+def _gather(table, block, z, count, turn, acc):
+    """Put the amplitudes' sum over one block into `acc` (6, LANES), four columns at a time; rotations times `turn`."""
     for c in range(6):
         for l in range(LANES):
             acc[c, l] = F(0.0)
@@ -163,18 +163,21 @@ def _gather(table, block, z, count, acc):
         for c in range(6):
             for l in range(LANES):
                 acc[c, l] += (
-                    z0 * table[block, k, c, l]
-                    + z1 * table[block, k + 1, c, l]
-                    + z2 * table[block, k + 2, c, l]
-                    + z3 * table[block, k + 3, c, l]
+                    z0 * F(table[block, k, c, l])
+                    + z1 * F(table[block, k + 1, c, l])
+                    + z2 * F(table[block, k + 2, c, l])
+                    + z3 * F(table[block, k + 3, c, l])
                 )
         k += 4
     while k < count:
         z0 = z[k]
         for c in range(6):
             for l in range(LANES):
-                acc[c, l] += z0 * table[block, k, c, l]
+                acc[c, l] += z0 * F(table[block, k, c, l])
         k += 1
+    for c in range(3, 6):
+        for l in range(LANES):
+            acc[c, l] *= turn
 
 
 @kernel(inline=True)
@@ -229,8 +232,8 @@ def _turn_far(acc):
 
 
 @kernel(inline=True)
-def _warp_block(rest, table, block, z, count, acc, out):
-    _gather(table, block, z, count, acc)
+def _warp_block(rest, table, block, z, count, turn, acc, out):
+    _gather(table, block, z, count, turn, acc)
     largest = F(0.0)
     for l in range(LANES):
         largest = max(largest, acc[3, l] * acc[3, l] + acc[4, l] * acc[4, l] + acc[5, l] * acc[5, l])
@@ -246,22 +249,23 @@ def _warp_block(rest, table, block, z, count, acc, out):
 
 
 @kernel
-def warp_blocks(rest, table, z, count, scratch, out):
+def warp_blocks(rest, table, z, count, turn, scratch, out):
     """Write the warped points of all blocks into `out` (n, 3) float32.
 
-    rest : (n, 3)   table : (blocks, columns, 6, LANES)   z : the first `count` amplitudes   scratch : (1, 6, LANES)
+    rest : (n, 3)   table : (blocks, columns, 6, LANES) float32 or int16   z : the first `count` amplitudes
+    turn : factor on the rotations of the table   scratch : (1, 6, LANES)
     """
     for block in range(len(table)):
-        _warp_block(rest, table, block, z, count, scratch[0], out)
+        _warp_block(rest, table, block, z, count, turn, scratch[0], out)
 
 
 @kernel(parallel=True)
-def warp_blocks_parallel(rest, table, z, count, scratch, out):
+def warp_blocks_parallel(rest, table, z, count, turn, scratch, out):
     """Do the same with one thread for each layer of `scratch` (threads, 6, LANES); the same bytes come out."""
     threads = len(scratch)
     for t in prange(threads):
         for block in range(t * len(table) // threads, (t + 1) * len(table) // threads):
-            _warp_block(rest, table, block, z, count, scratch[t], out)
+            _warp_block(rest, table, block, z, count, turn, scratch[t], out)
 
 
 @kernel

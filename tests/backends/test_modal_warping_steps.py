@@ -17,7 +17,7 @@ from faceanim.backends.modal_warping.twist import mean_rotation, rotation, twist
 from faceanim.backends.nodal import carried
 from faceanim.backends.solver import StepReport
 from faceanim.body.control import Control
-from faceanim.geometry.embedding import embed
+from faceanim.geometry.embedding import Embedding, embed
 from faceanim.ground.errors import DivergenceError, UserError
 
 STEP = 1 / 60
@@ -296,6 +296,11 @@ def test_many_vertices_two_ways() -> None:
         np.testing.assert_allclose(by_node, exact, atol=1e-4)
     own = vertex_warp(solver, skin).points(amplitudes(state))
     assert 1e-6 < np.abs(own - exact).max() < 0.3
+    both = Embedding(
+        np.concatenate([skin.node, skin.node[::-1]], 1), 0.5 * np.concatenate([skin.weight, skin.weight[::-1]], 1)
+    )
+    SkinWarp(solver, both).points(state, by_node)  # some vertices are carried by eight nodes
+    np.testing.assert_allclose(by_node, both.apply(solver.nodes(state)), atol=1e-4)
 
 
 def test_a_far_rotation_is_noted_and_a_runaway_is_an_error() -> None:
