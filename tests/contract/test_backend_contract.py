@@ -14,7 +14,10 @@ from faceanim.backends import BACKENDS, backend_class, make_solver
 from faceanim.backends.solver import StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
+from faceanim.expression.library import load_expression
+from faceanim.face.library import load_face
 from faceanim.ground.errors import UserError
+from faceanim.session.session import Session
 
 STEP = 1 / 60
 
@@ -211,3 +214,26 @@ def test_a_sheet_of_springs_takes_no_loads() -> None:
     load.gravity[:] = (0.0, -9810.0, 0.0)
     with pytest.raises(UserError, match="gravity"):
         make_solver("mass_spring", body).solve_static(load)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(BACKENDS))
+def test_a_face_answers_on_every_backend(name: str) -> None:
+    """At rest it is the face; a smile with an opening jaw moves the corner of the mouth out and the chin down, held
+    skin goes with its bones, and mirror images stay mirror images."""
+    face = load_face(density="coarse")
+    session = Session(face, load_expression("6+12+26"), backend=name, duration=0.2)
+    body, solver = session.body, session.solver
+    np.testing.assert_allclose(surface(solver, solver.rest(), body), body.surface.points, atol=1e-6)
+    state, asked = solver.rest(), session.control(0.3)
+    for _ in range(6):
+        solver.step(state, state, asked, STEP)
+    moved = surface(solver, state, body) - body.surface.points
+    corner, chin = face.landmarks["cheilion_left"], face.landmarks["pogonion"]
+    assert moved[corner, 0] > 0.2 and moved[chin, 1] < -0.5
+    assert np.linalg.norm(moved, axis=1).max() < 25.0
+    x = body.surface.points
+    places = np.einsum("bij,nj->nbi", asked.bone_pose[:, :3, :3], x) + asked.bone_pose[None, :, :3, 3]
+    expected = np.einsum("nb,nbi->ni", body.attachment.bone_weight, places) - x
+    np.testing.assert_allclose(moved[body.pinned], expected[body.pinned], atol=1e-6)
+    np.testing.assert_allclose(moved[face.mirror], moved * [-1.0, 1.0, 1.0], atol=0.15)
