@@ -16,6 +16,11 @@ _PUBLIC = {
     "express": "faceanim.session.session",
     "Session": "faceanim.session.session",
     "make_solver": "faceanim.backends",
+    "Control": "faceanim.body.control",
+    "Material": "faceanim.tissue.material",
+    "box_tets": "faceanim.geometry.shapes",
+    "read_volume": "faceanim.geometry.meshio_bridge",
+    "solid_body": "faceanim.body.solid",
 }
 
 __all__ = ["__version__", *_PUBLIC]
