@@ -42,7 +42,7 @@ GRAINS = {"coarse": Grain(3, 9.5), "default": Grain(3, 6.7), "fine": Grain(4, 3.
 LEAST_QUALITY = 0.06
 """Every element is at least so well shaped (`TetMesh.quality`)."""
 _BLEND = 8.0
-_VERSION = "tissue volume 14"
+_VERSION = "tissue volume 15"
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -58,11 +59,25 @@ def barycentric(mesh: TetMesh, tets: Ints, points: Floats) -> Floats:
     return out
 
 
+def _search_wider(
+    mesh: TetMesh, points: Floats, lost: np.ndarray, allowed: np.ndarray, tree: cKDTree, tet: Any
+) -> None:
+    """Look for elements that contain the points `lost` although many others have nearer centres; write them into `tet`."""
+    reach = np.linalg.norm(mesh.points[mesh.tets[allowed]] - tree.data[:, None], axis=2).max(axis=1)
+    for i, near in zip(lost, tree.query_ball_point(points[lost], float(reach.max())), strict=True):
+        near = np.array(near, dtype=np.int64)
+        near = near[np.linalg.norm(tree.data[near] - points[i], axis=1) <= reach[near]]
+        if len(near):
+            inside = barycentric(mesh, allowed[near], np.broadcast_to(points[i], (len(near), 3))).min(axis=1)
+            if inside.max() >= -1e-12:
+                tet[i] = allowed[near[np.argmax(inside)]]
+
+
 def embed(mesh: TetMesh, points: Floats, *, among: Ints | None = None, candidates: int = 24) -> Embedding:
     """Return `points` (k, 3) as carried by the elements of `mesh`: by the one that contains a point, else the nearest.
 
     A point outside every element gets the extrapolating weights of the element in which it is least outside.
-    among : elements that may carry (None = all)   candidates : how many near elements are tried for each point
+    among : elements that may carry (None = all)   candidates : how many near elements are tried for each point at first
     """
     allowed = np.arange(len(mesh.tets)) if among is None else np.asarray(among)
     if not len(allowed):
@@ -78,5 +93,8 @@ def embed(mesh: TetMesh, points: Floats, *, among: Ints | None = None, candidate
         inside = barycentric(mesh, column, points).min(axis=1)
         better = inside > best + 1e-12
         best[better], tet[better] = inside[better], column[better]
+    lost = np.flatnonzero(best < 0.0)
+    if len(lost) and tries < len(allowed):
+        _search_wider(mesh, points, lost, allowed, tree, tet)
     weight = barycentric(mesh, tet, points)
     return Embedding(np.ascontiguousarray(mesh.tets[tet]), np.ascontiguousarray(weight))
