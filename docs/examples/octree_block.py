@@ -83,6 +83,8 @@ def main(out: str | Path) -> float:
         draw(axes, model, x, most)
         axes.set_title(f"level {k}: {len(model.tables.springs.i)} springs, error {errors[k]:.0f} %")
     figure.tight_layout()
+    scale = plt.cm.ScalarMappable(plt.Normalize(0.0, most), "viridis")
+    figure.colorbar(scale, ax=figure.axes, shrink=0.7, pad=0.02, label="displacement, in widths of the block")
     figure.savefig(Path(out) / "octree_block.png", dpi=110)
     plt.close(figure)
     return errors[1]

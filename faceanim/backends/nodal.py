@@ -24,7 +24,11 @@ def solid_of(body: Body, backend: str) -> Solid:
 
 def carried(solid: Solid, pose: Floats) -> Floats:
     """Return where the bones at `pose` (n_bone, 4, 4) carry the held nodes, (n_held, 3) [mm]."""
-    points, weight = solid.mesh.points[solid.held], solid.bone_weight[solid.held]
+    return carry(solid.mesh.points[solid.held], solid.bone_weight[solid.held], pose)
+
+
+def carry(points: Floats, weight: Floats, pose: Floats) -> Floats:
+    """Return where the bones at `pose` carry `points` (n, 3) by their `weight` (n, n_bone), (n, 3) [mm]."""
     moved = np.einsum("bij,nj->nbi", pose[:, :3, :3], points) + pose[None, :, :3, 3]
     return np.einsum("nb,nbi->ni", weight, moved)
 

@@ -39,6 +39,15 @@ class StepReport:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+class Notices(list[str]):
+    """What a solver has left out or has had to do to go on, in words, each said once."""
+
+    def once(self, text: str) -> None:
+        """Add `text` unless it is there."""
+        if text not in self:
+            self.append(text)
+
+
 @dataclass(frozen=True)
 class Energy:
     """Energies [uJ = mN mm]; `total` is what a static solution minimises plus the kinetic part."""

@@ -20,6 +20,7 @@ from faceanim.geometry.embedding import Embedding
 from faceanim.geometry.volume import TetMesh
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.cache import content_key, load_arrays, save_arrays
+from faceanim.ground.notes import tell
 
 if TYPE_CHECKING:
     from faceanim.face.face import Face
@@ -71,6 +72,7 @@ def flesh(face: Face) -> Flesh:
     key = content_key(_VERSION, grain, LEAST_QUALITY, *_ingredients(face))
     kept = load_arrays("tissue", key)
     if kept is None:
+        tell("growing the flesh between skin and bone")
         kept = _grown(face, grain)
         save_arrays("tissue", key, **kept)
     solid = Solid(

@@ -2,7 +2,7 @@
 
 Numba does not notice edits in a kernel that another kernel imports, so the cache folder is keyed by a hash of all
 kernel sources and of the versions that shape the machine code. Where that folder cannot be written, a temporary one
-is used and `cache_notice()` says so.
+is used and `folders.cache_notice()` says so.
 """
 
 from __future__ import annotations

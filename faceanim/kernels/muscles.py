@@ -100,6 +100,26 @@ def pull(fibres, activation, pose, x, force):
 
 
 @kernel
+def pull_energy(fibres, activation, pose, x):
+    """Return the energy of what `pull` does to the vertices `x` (n, 3) [uJ]."""
+    total = 0.0
+    for i in range(len(x)):
+        for e in range(fibres.start[i], fibres.start[i + 1]):
+            dx, dy, dz = turned(fibres, e, pose)
+            f = activation[fibres.muscle[e]] * fibres.strength[e]
+            if fibres.kind[e] == 0:
+                b = fibres.bone[e]
+                eps = fibres.softening[e]
+                dx += pose[b, 0, 3] - x[i, 0]
+                dy += pose[b, 1, 3] - x[i, 1]
+                dz += pose[b, 2, 3] - x[i, 2]
+                total += f * math.sqrt(dx * dx + dy * dy + dz * dz + eps * eps)
+            else:
+                total -= f * (dx * x[i, 0] + dy * x[i, 1] + dz * x[i, 2])
+    return total
+
+
+@kernel
 def fibre_energy(x, moment, m):
     """Return the energy of the pulls on the first `m` vertices [uJ]."""
     total = 0.0

@@ -12,7 +12,7 @@ from faceanim.backends.finite_elements.newton import Newton, Report, newton
 from faceanim.backends.finite_elements.options import Options
 from faceanim.backends.finite_elements.terms import Pulls, Quadratic, carried_by, coupled
 from faceanim.backends.nodal import carried, solid_of
-from faceanim.backends.solver import Energy, State, StepReport
+from faceanim.backends.solver import Energy, Notices, State, StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
 from faceanim.ground.arrays import Floats
@@ -42,7 +42,7 @@ class SolverFiniteElements:
             order=self.options.order, law=self.options.law, coupled=coupled(body, skin),
         )  # fmt: skip
         self.dt_max = np.inf
-        self.notices: list[str] = []
+        self.notices = Notices()
         self.inverted = 0
         self.static_report = Report()
         self.last_static: State | None = None
@@ -146,19 +146,17 @@ class SolverFiniteElements:
         if guess is not None and np.isfinite(self.elements.energy(self._fit(guess).q)):
             return guess.q
         if guess is not None:
-            self.notices.append("the guess has inverted elements, so the search for equilibrium began at rest")
+            self.notices.once("the guess has inverted elements, so the search for equilibrium began at rest")
         return self._carried_rest(control.bone_pose)
 
     def _note_doubts(self, report: Report) -> None:
         if report.definite is False:
-            self.notices.append(
-                "the equilibrium found is not stable: the flesh may buckle to a lower energy from there"
-            )
+            self.notices.once("the equilibrium found is not stable: the flesh may buckle to a lower energy from there")
         self._note_inversion(0 if report.valid else report.inverted)
 
     def _note_inversion(self, count: int) -> None:
         if count and not self.inverted:
-            self.notices.append(
+            self.notices.once(
                 f"{count} of {len(self.elements.node)} elements are inverted: law {self.options.law!r} means nothing "
                 "there; take 'neo_hookean', or less load"
             )

@@ -9,6 +9,7 @@ from faceanim.body.body import PULL_TO_POINT, Body
 from faceanim.body.control import Control
 from faceanim.body.solid import Solid
 from faceanim.ground.arrays import Floats, Ints
+from faceanim.kernels import muscles
 
 
 class Loads(Pull):
@@ -16,7 +17,6 @@ class Loads(Pull):
 
     def __init__(self, body: Body, solid: Solid) -> None:
         super().__init__(body, solid)
-        self.muscles = body.muscles
         self.held = solid.held
         self.rest = solid.mesh.points
         self.surface = body.surface.points.copy()
@@ -38,19 +38,10 @@ class Loads(Pull):
         total = -float(self.mass @ moved @ control.gravity)
         if control.force is not None:
             total -= float((control.force * (self.matrix @ moved)).sum())
-        m = self.muscles
-        pull = control.activation[m.muscle] * m.max_force[m.muscle] * m.weight
-        active = np.flatnonzero(pull)
-        if not len(active):
-            return total
-        pose = control.bone_pose[m.bone[active]]
-        at = (self.matrix @ points)[m.node[active]]
-        aim = np.einsum("kij,kj->ki", pose[:, :3, :3], m.point[active])
-        d = aim + pose[:, :3, 3] - at
-        soft = np.maximum(m.softening[active], 1e-3)
-        to_point = np.sqrt((d**2).sum(axis=1) + soft**2)
-        along = -(aim * at).sum(axis=1)
-        return total + float(pull[active] @ np.where(m.kind[active] == PULL_TO_POINT, to_point, along))
+        if control.activation.any():
+            surface = np.asarray(self.matrix @ points)
+            total += float(muscles.pull_energy(self.fibres, control.activation, control.bone_pose, surface))
+        return total
 
 
 class MuscleStiffness:

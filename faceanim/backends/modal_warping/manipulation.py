@@ -171,12 +171,12 @@ class Manipulation:
             way_out = "fewer conditions, more modes or more exercised nodes are needed"
             if self._first == "orientation":
                 way_out = "exercise more nodes around the turned one, or keep more modes"
-            self.solver.notice(
+            self.solver.notices.once(
                 f"{len(first)} {self._first} conditions exceed what {m} modes and {len(self.exercised)} exercised "
                 f"nodes can meet (rank {_rank(first, RCOND)}): met by damped least squares; {way_out}"
             )
         elif _rank(_stack(b, o), RCOND_REST) < len(b) + len(o):
-            self.solver.notice(
+            self.solver.notices.once(
                 f"position and orientation conditions cannot all be met (rank {_rank(_stack(b, o), RCOND_REST)} of "
                 f"{len(b) + len(o)}): {self._first} goes first; exercise more nodes or keep more modes"
             )
@@ -207,7 +207,7 @@ class Manipulation:
             w = self._moved(np.concatenate([free, xi]) if self.turning == "unconstrained" else before)[1]
             y = self._once(free, xi, w, tables)
             if self._strays(free, xi, tables.reach @ y):
-                self.solver.notice(
+                self.solver.notices.once(
                     f"turning {self.turning!r} led away from a far target: Newton steps were taken instead"
                 )
                 y, report.iterations = self._newton(free, xi, tables)
@@ -281,7 +281,7 @@ class Manipulation:
             if near and self._weigh(after, size) < self._weigh(errors, size) * (1.0 - 1e-6):
                 return move, after
             if not near:
-                self.solver.notice("a dragged node has turned by nearly a full turn, where Rt cannot be inverted")
+                self.solver.notices.once("a dragged node has turned by nearly a full turn, where Rt cannot be inverted")
             move = 0.5 * move
         return move, None
 

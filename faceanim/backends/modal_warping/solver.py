@@ -18,7 +18,7 @@ from faceanim.backends.modal_warping.shape import make_shape
 from faceanim.backends.modal_warping.statics import Balance, equilibrium, growth_rate
 from faceanim.backends.modal_warping.twist import FARTHEST, twist_of
 from faceanim.backends.nodal import push_out, solid_of
-from faceanim.backends.solver import Energy, State, StepReport
+from faceanim.backends.solver import Energy, Notices, State, StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
 from faceanim.ground.arrays import Floats
@@ -68,7 +68,7 @@ class SolverModalWarping:
         self._muscle_stiffness = MuscleStiffness(body, self.loads, self.modes.shapes())
         self.manipulation: Manipulation | None = None
         self.static_report = StepReport()
-        self.notices: list[str] = []
+        self.notices = Notices()
         self.dt_max = np.inf
         self._recurrence: dict[float, Recurrence] = {}
         self._rate = np.zeros((len(self.solid.mesh.points), 6))
@@ -79,11 +79,6 @@ class SolverModalWarping:
     @property
     def _by_node(self) -> bool:
         return not self.options.variant.startswith("rotation_strain")
-
-    def notice(self, text: str) -> None:
-        """Add `text` to the notices, unless it is there."""
-        if text not in self.notices:
-            self.notices.append(text)
 
     def rest(self) -> StateModalWarping:
         """Return a new state: the body at rest."""
@@ -191,7 +186,7 @@ class SolverModalWarping:
                 "or variant 'consistent'"
             )
         if float((self.shape.moved[:, 3:] ** 2).sum(axis=1).max()) > FARTHEST**2 and self.shape.warped:
-            self.notice("a node has turned by nearly a full turn or more, where warping loses a direction")
+            self.notices.once("a node has turned by nearly a full turn or more, where warping loses a direction")
 
     def solve_static(self, control: Control, guess: State | None = None) -> StateModalWarping:
         """Return the equilibrium of the chosen variant, near `guess` (default: rest).
@@ -213,12 +208,12 @@ class SolverModalWarping:
         converged = error < 10.0 * self.options.static_tolerance
         self.static_report = StepReport(balance.evaluations, error, converged)
         if not converged:
-            self.notice(
+            self.notices.once(
                 f"no equilibrium of variant {self.options.variant!r} was found (relative residual {error:.1e}): the "
                 "load is too high for it; variant 'consistent' or 'rotation_strain' bears more"
             )
         elif balance.energy is None and growth_rate(balance, q, self.damping) > 1e-3 * balance.root[0]:
-            self.notice(
+            self.notices.once(
                 f"variant {self.options.variant!r} would oscillate by itself about this equilibrium: its force has no "
                 "energy (Eq. 18); variant 'consistent' does not"
             )

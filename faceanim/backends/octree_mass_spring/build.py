@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from faceanim.backends.nodal import carried, fibre_table, solid_of
+from faceanim.backends.nodal import carried, carry, fibre_table, solid_of
 from faceanim.backends.octree_mass_spring.cut import box_cut, budget_cut, important_cut, safe_cut
 from faceanim.backends.octree_mass_spring.lattice import Lattice
 from faceanim.backends.octree_mass_spring.model import Model, Points, assemble, tied
@@ -36,10 +36,6 @@ class Flesh:
     def __init__(self, body: Body, options: Options) -> None:
         self.body, self.options = body, options
         solid = self.solid = solid_of(body, "octree_mass_spring")
-        if not solid.held.any():
-            raise UserError(
-                "octree_mass_spring: nothing is held, so the body would float away; hold at least three nodes"
-            )
         extent = float(np.ptp(solid.mesh.points, axis=0).max())
         side = extent / options.cells if options.cell_size is None else options.cell_size
         self.firm = self._firm_elements()
@@ -203,27 +199,22 @@ class _Pull:
             muscles.pull(self.fibres, control.activation, control.bone_pose, place, self._force)
             out += self._spread @ self._force
 
-    def _fibres_at(self, x: Floats, control: Control) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return of every fibre pull (e,) [mN], softened distance (e,), its turned point (e, 3) and vertex (e, 3) [mm]."""
-        f, pose = self.fibres, control.bone_pose
-        place = self._place(x, pose)[self._row]
-        turned = np.einsum("eij,ej->ei", pose[f.bone, :3, :3], f.point)
-        away = turned + pose[f.bone, :3, 3] - place
-        return control.activation[f.muscle] * f.strength, np.sqrt((away**2).sum(axis=1) + f.softening**2), turned, place
-
     def energy(self, x: Floats, control: Control) -> float:
         """Return the potential [uJ]."""
         if not len(self.vertex):
             return 0.0
-        pull, distance, turned, place = self._fibres_at(x, control)
-        return float(np.where(self.fibres.kind == 0, pull * distance, -pull * (turned * place).sum(axis=1)).sum())
+        pose = control.bone_pose
+        return float(muscles.pull_energy(self.fibres, control.activation, pose, self._place(x, pose)))
 
     def stiffness(self, x: Floats, control: Control) -> Floats | None:
         """Return the sums of the rows of the stiffness across the fibres, in size, (n,) [mN/mm]; None if there is none."""
         if not len(self.vertex):
             return None
-        pull, distance, _, _ = self._fibres_at(x, control)
-        across = np.where(self.fibres.kind == 0, pull / distance, 0.0)
+        f, pose = self.fibres, control.bone_pose
+        away = np.einsum("eij,ej->ei", pose[f.bone, :3, :3], f.point) + pose[f.bone, :3, 3]
+        away -= self._place(x, pose)[self._row]
+        pull = control.activation[f.muscle] * f.strength
+        across = np.where(f.kind == 0, pull / np.sqrt((away**2).sum(axis=1) + f.softening**2), 0.0)
         return np.asarray(self._lump @ np.bincount(self._row, across, len(self.vertex)))
 
 
@@ -271,9 +262,8 @@ class Rig:
         """Return the surface (n_surface, 3) [mm] for nodes at `x` (n, 3); pinned vertices exactly where `pose` puts them."""
         body, solid = self.flesh.body, self.flesh.solid
         out = np.asarray(self.by_cells @ x + self.by_bones @ carried(solid, pose))
-        rest, weight = body.surface.points[body.pinned], body.attachment.bone_weight[body.pinned]
-        moved = np.einsum("bij,nj->nbi", pose[:, :3, :3], rest) + pose[None, :, :3, 3]
-        out[body.pinned] = np.einsum("nb,nbi->ni", weight, moved)
+        pinned = body.pinned
+        out[pinned] = carry(body.surface.points[pinned], body.attachment.bone_weight[pinned], pose)
         return out
 
     def load(self, control: Control, x: Floats) -> Floats:

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from faceanim.backends.nodal import push_out, solid_of
+from faceanim.backends.nodal import push_out
 from faceanim.backends.octree_mass_spring.build import Flesh, Rig
 from faceanim.backends.octree_mass_spring.motion import Moment, Motion
 from faceanim.backends.octree_mass_spring.options import Options
 from faceanim.backends.octree_mass_spring.static import StaticReport, equilibrium
 from faceanim.backends.octree_mass_spring.transfer import transfer
-from faceanim.backends.solver import Energy, State, StepReport
+from faceanim.backends.solver import Energy, Notices, State, StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
 from faceanim.ground.arrays import Floats, Ints
@@ -64,10 +64,10 @@ class SolverOctreeMassSpring:
     def __init__(self, body: Body, options: Any = None) -> None:
         self.body = body
         self.options: Options = Options() if options is None else options
-        self.notices: list[str] = []
+        self.notices = Notices()
         self.static_report = StaticReport()
-        self.solid = solid_of(body, "octree_mass_spring")
         self.flesh = Flesh(body, self.options)
+        self.solid = self.flesh.solid
         self.lattice = self.flesh.lattice
         self._rigs: dict[bytes, Rig] = {}
         leaves = np.zeros(len(self.lattice.stiffness), dtype=np.int32)
@@ -76,7 +76,7 @@ class SolverOctreeMassSpring:
         self._replace_stiffness_damping()
         self.dt_max = np.inf
         self.substep = self.rig(self.base).dt_max * self.options.safety
-        self.motion = Motion(self.options, self.notice)
+        self.motion = Motion(self.options, self.notices.once)
         self._say_what_is_missing()
 
     def _replace_stiffness_damping(self) -> None:
@@ -86,7 +86,7 @@ class SolverOctreeMassSpring:
         slowest = self.rig(self.base).model.slowest()
         self.flesh.drag += self.solid.stiffness_damping * slowest**2
         self._rigs.clear()
-        self.notice(
+        self.notices.once(
             f"damping by stiffness is not modelled; damping by mass was raised from {self.solid.damping:.4g} to "
             f"{self.flesh.drag:.4g} / s, so that the slowest vibration ({slowest:.4g} / s) dies as fast"
         )
@@ -94,14 +94,9 @@ class SolverOctreeMassSpring:
     def _say_what_is_missing(self) -> None:
         body = self.body
         if any(abs(m.poisson_ratio - 0.25) > 0.01 for m in self.solid.materials):
-            self.notice("a lattice of springs has Poisson's ratio 1/4; the materials' own ratios are not used")
+            self.notices.once("a lattice of springs has Poisson's ratio 1/4; the materials' own ratios are not used")
         if body.bone_contact is not None or body.spheres or body.pairs:
-            self.notice("contact is not modelled")
-
-    def notice(self, text: str) -> None:
-        """Remember `text` once."""
-        if text not in self.notices:
-            self.notices.append(text)
+            self.notices.once("contact is not modelled")
 
     def rig(self, level: Ints) -> Rig:
         """Return what is stepped at the leaf levels `level` (c,); the last few are kept."""
@@ -150,7 +145,7 @@ class SolverOctreeMassSpring:
         if not self.static_report.converged:
             state = self._relaxed(start, control)
         if not self.static_report.converged:
-            self.notice(f"an equilibrium was not reached: {self.static_report.residual:.3g} mN are left over")
+            self.notices.once(f"an equilibrium was not reached: {self.static_report.residual:.3g} mN are left over")
         return state
 
     def _newton(self, state: StateOctree, control: Control) -> None:
@@ -263,7 +258,7 @@ class SolverOctreeMassSpring:
             return rig, x, v
         quiet[ready] = 0
         x, v = transfer(rig.model, new.model, x, v)
-        self.notice("quiet cells were made finer again")
+        self.notices.once("quiet cells were made finer again")
         return new, x, v
 
 
