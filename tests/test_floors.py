@@ -17,6 +17,7 @@ FLOORS = {
     "geometry": 2,
     "tissue": 2,
     "body": 3,
+    "elements": 3,
     "backends": 4,
     "face": 4,
     "expression": 4,

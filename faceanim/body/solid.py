@@ -20,6 +20,31 @@ from faceanim.tissue.spring_law import SpringLaw
 
 
 @dataclass(frozen=True, eq=False)
+class ThinLayer:
+    """An outer layer one element thick, which a model may replace by a shell.
+
+    region : the material of its elements   outer, inner : (m,) nodes on either side, pair by pair
+    triangles : (t, 3) over the pairs, outside to the left
+    """
+
+    region: int
+    outer: Ints
+    inner: Ints
+    triangles: Ints
+
+    @classmethod
+    def between(cls, mesh: TetMesh, region: Ints, which: int, outer: Ints, inner: Ints) -> ThinLayer:
+        """Return the layer of the elements of material `which` between the nodes `outer` (m,) and `inner` (m,)."""
+        pair = np.full(len(mesh.points), -1, dtype=np.int32)
+        pair[outer] = np.arange(len(outer))
+        outside = pair[mesh.tets] >= 0
+        on_top = (region == which) & (outside.sum(axis=1) == 3)
+        # the face opposite a corner, seen from outside
+        faces = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])[np.argmin(outside[on_top], axis=1)]
+        return cls(which, outer, inner, pair[np.take_along_axis(mesh.tets[on_top], faces, axis=1)])
+
+
+@dataclass(frozen=True, eq=False)
 class Solid:
     """The volume of a body, in its rest frame.
 
@@ -27,6 +52,7 @@ class Solid:
     bone_weight : (n, n_bone) [-]; a node held by bones has a row that sums to 1 and goes where their weighted poses
     take it, a free node a row of zeros
     skin : the body's surface vertices as carried by the nodes
+    layer : the skin as a layer of the mesh, None = there is none
     damping [1/s], stiffness_damping [s] : Rayleigh coefficients xi and zeta, the force -(xi M + zeta K) v; they stand
     for those of the body, which are made for a sheet
     """
@@ -38,6 +64,7 @@ class Solid:
     skin: Embedding
     damping: float = 0.0
     stiffness_damping: float = 0.0
+    layer: ThinLayer | None = None
 
     def __post_init__(self) -> None:
         e, n = len(self.mesh.tets), len(self.mesh.points)

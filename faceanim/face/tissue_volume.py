@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faceanim.body.solid import Solid
+from faceanim.body.solid import Solid, ThinLayer
 from faceanim.face.columns import Columns, grow, is_symmetric, stacked
 from faceanim.face.tissue_carry import carry
 from faceanim.face.tissue_layers import muscular
@@ -75,14 +75,17 @@ def flesh(face: Face) -> Flesh:
         tell("growing the flesh between skin and bone")
         kept = _grown(face, grain)
         save_arrays("tissue", key, **kept)
+    mesh = TetMesh(kept["points"], kept["tets"])
+    outer = np.arange(0, len(mesh.points), grain.layers + 1, dtype=np.int32)
     solid = Solid(
-        mesh=TetMesh(kept["points"], kept["tets"]),
+        mesh=mesh,
         materials=face.tissue.materials(),
         region=kept["region"],
         bone_weight=kept["bone_weight"],
         skin=Embedding(kept["skin_node"], kept["skin_weight"]),
         damping=face.tissue.solid.damping,
         stiffness_damping=face.tissue.solid.stiffness_damping,
+        layer=ThinLayer.between(mesh, kept["region"], SKIN_LAYER, outer, outer + 1),
     )
     return Flesh(solid, kept["rigid"], kept["vertex"], kept["shortened"], kept["twin"])
 

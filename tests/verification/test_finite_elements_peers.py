@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from faceanim.backends.finite_elements.elements import Elements
-from faceanim.backends.finite_elements.newton import newton
+from faceanim.elements.newton import newton
+from faceanim.elements.tetrahedra import Elements
 from faceanim.geometry.shapes import box_tets
 from faceanim.geometry.volume import TetMesh
 from faceanim.tissue.material import Material

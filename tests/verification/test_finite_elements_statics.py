@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from faceanim.backends.finite_elements.elements import BARRIER, LAWS, Elements
-from faceanim.backends.finite_elements.newton import newton
+from faceanim.elements.newton import newton
+from faceanim.elements.tetrahedra import BARRIER, LAWS, Elements
 from faceanim.geometry.shapes import box_tets
 from faceanim.geometry.volume import TetMesh
 from faceanim.ground.errors import UserError

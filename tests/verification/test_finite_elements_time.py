@@ -10,13 +10,13 @@ import pytest
 from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
-from faceanim.backends.finite_elements.elements import Elements
-from faceanim.backends.finite_elements.newton import newton
 from faceanim.backends.finite_elements.options import Options
 from faceanim.backends.finite_elements.solver import SolverFiniteElements
-from faceanim.backends.finite_elements.terms import Quadratic
+from faceanim.backends.pulls import Quadratic
 from faceanim.body.control import Control
 from faceanim.body.solid import solid_body
+from faceanim.elements.newton import newton
+from faceanim.elements.tetrahedra import Elements
 from faceanim.geometry.shapes import box_tets
 from faceanim.tissue.material import Material
 

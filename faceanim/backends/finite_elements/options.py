@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from faceanim.backends.finite_elements.elements import LAWS
+from faceanim.elements.tetrahedra import LAWS
 from faceanim.ground.errors import UserError, unknown_name
 
 INTEGRATORS = ("backward_euler", "trapezoid")

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from faceanim.backends.finite_elements.elements import BARRIER, Elements
-from faceanim.backends.finite_elements.newton import Newton, Report, newton
 from faceanim.backends.finite_elements.options import Options
-from faceanim.backends.finite_elements.terms import Pulls, Quadratic, carried_by, coupled
 from faceanim.backends.nodal import carried, solid_of
+from faceanim.backends.pulls import Pulls, Quadratic, carried_by, coupled
 from faceanim.backends.solver import Energy, Notices, State, StepReport
 from faceanim.body.body import Body
 from faceanim.body.control import Control
+from faceanim.elements.newton import Newton, Report, newton
+from faceanim.elements.tetrahedra import BARRIER, Elements
 from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import DivergenceError, RunError, UserError
 

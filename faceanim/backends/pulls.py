@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from faceanim.backends.finite_elements import shapes
-from faceanim.backends.finite_elements.elements import Elements
 from faceanim.backends.nodal import fibre_table
 from faceanim.body.body import Body
 from faceanim.body.control import Control
+from faceanim.elements import shapes
+from faceanim.elements.tetrahedra import Elements
 from faceanim.geometry.embedding import Embedding
 from faceanim.ground.arrays import Floats, Ints
 from faceanim.kernels import muscles

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from faceanim.backends.finite_elements import shapes
+from faceanim.elements import shapes
+from faceanim.elements.factor import Factor
 from faceanim.geometry.topology import grouped
 from faceanim.geometry.volume import TetMesh
-from faceanim.ground.arrays import Floats, Ints, floats, frozen, ints
+from faceanim.ground.arrays import Bools, Floats, Ints, floats, frozen, ints
 from faceanim.ground.errors import UserError, unknown_name
 from faceanim.kernels import hyperelastic, solids
 from faceanim.tissue.material import Material
@@ -155,6 +156,22 @@ class Elements:
         count = self._gather.row[i.astype(np.int64) + 1] - first
         at = 9 * first + 3 * (pair - first)
         return np.asarray(at[:, None, None] + 3 * count[:, None, None] * np.arange(3)[:, None] + np.arange(3))
+
+    @property
+    def linear(self) -> bool:
+        """Whether the law is linear: then it holds, as a mathematical model, at any deformation."""
+        return self.law == "linear"
+
+    @cached_property
+    def stiffness_scale(self) -> float:
+        """The elastic energy of a body whose strains are all about 1 [uJ]."""
+        cells = self.cells
+        stiff = cells.constant[:, 0] + 2.0 * cells.constant[:, 1]
+        return float((stiff * cells.weight.sum(axis=1)).sum())
+
+    def factorisation(self, free: Bools) -> Factor:
+        """Return what solves with the tangent over the freedoms that are `free`, (n, 3)."""
+        return Factor(self, free)
 
     def _displacement(self, x: Floats) -> Floats:
         if np.shape(x) != self.points.shape:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from faceanim.backends.finite_elements.elements import Elements
 from faceanim.ground.arrays import Bools, Floats, Ints
 
 LEAF = 16
@@ -59,15 +58,27 @@ def _touching(adjacent: sparse.csr_matrix, nodes: Ints, others: Ints, mark: Floa
     return out
 
 
+class Patterned(Protocol):
+    """A matrix over the freedoms of nodes, in a fixed pattern; `node_pattern` (n, n) says which nodes are coupled."""
+
+    points: Floats
+    indices: Ints
+    node_pattern: sparse.csr_matrix
+
+    def matrix(self, values: Floats) -> sparse.csr_matrix:
+        """Return the matrix (3n, 3n) with these `values`."""
+
+
 class Factor:
     """Solves K u = b for the free freedoms of `elements`; the others of u are zero.
 
     SuperLU in symmetric mode without pivoting, on rows in nested dissection order.
     """
 
-    def __init__(self, elements: Elements, free: Bools) -> None:
+    def __init__(self, elements: Patterned, free: Bools) -> None:
         self.free = free.ravel().copy()
-        self._size = elements.size
+        self._elements = elements
+        self._values: Floats = np.zeros(len(elements.indices))
         nodes = np.flatnonzero(self.free.reshape(-1, 3).any(axis=1))
         pattern = elements.node_pattern[nodes][:, nodes]
         inner = nodes[dissected(elements.points[nodes], pattern)]
@@ -82,6 +93,7 @@ class Factor:
 
     def factor(self, values: Floats, shift: float = 0.0) -> bool:
         """Factorise the matrix with these `values` in the elements' pattern, plus `shift` I; return whether it could be."""
+        self._values = values
         self._matrix.data[:] = values[self._pick]
         matrix = self._matrix + shift * sparse.identity(len(self.rows), format="csc") if shift else self._matrix
         try:
@@ -90,9 +102,12 @@ class Factor:
             self._lu = None
         return self._lu is not None
 
-    def solve(self, right: Floats) -> Floats:
-        """Return u, (n, 3), for the right-hand side `right` (n, 3)."""
-        out = np.zeros(self._size)
+    def solve(self, right: Floats, moved: Floats | None = None) -> Floats:
+        """Return u, (n, 3), for the right-hand side `right` (n, 3) while the fixed freedoms go by `moved` (n, 3)."""
+        if moved is not None:
+            pushed = self._elements.matrix(self._values) @ moved.ravel()
+            right = right - pushed.reshape(-1, 3)
+        out = np.zeros(right.size)
         if len(self.rows):
             out[self.rows] = self._lu.solve(right.ravel()[self.rows])
         return out.reshape(-1, 3)

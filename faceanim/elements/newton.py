@@ -8,9 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from faceanim.backends.finite_elements.elements import Elements
-from faceanim.backends.finite_elements.factor import Factor
-from faceanim.ground.arrays import Bools, Floats
+from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 
 EPS = float(np.finfo(np.float64).eps)
@@ -20,6 +18,54 @@ SHORTEST = 1e-9
 """A line search gives up at this share of the step."""
 FLAT = 8
 """After so many steps that changed the energy by no more than rounding does, it is of no use to go on."""
+
+
+class Factorisation(Protocol):
+    """A tangent that can be solved with, for the freedoms that are free."""
+
+    def factor(self, values: Floats, shift: float = 0.0) -> bool:
+        """Factorise the tangent with these `values` plus `shift` I; return whether it could be."""
+
+    def solve(self, right: Floats, moved: Floats | None = None) -> Floats:
+        """Return the change of the free freedoms, (n, 3), that balances `right`; `moved` (n, 3) are the fixed ones'."""
+
+    def definite(self) -> bool:
+        """Return whether the tangent factorised last is positive definite on the freedoms that are free."""
+
+
+class System(Protocol):
+    """What has an energy over positions (n, 3); `points` are the rest positions.
+
+    indices : its length is that of the tangent's values   linear : whether the law holds at any deformation
+    stiffness_scale : [uJ] the elastic energy of a body whose strains are all about 1, as a measure of rounding
+    """
+
+    points: Floats
+    indices: Ints
+
+    @property
+    def linear(self) -> bool: ...
+
+    @property
+    def stiffness_scale(self) -> float: ...
+
+    def energy(self, x: Floats) -> float:
+        """Return the energy [uJ], infinite where it has none."""
+
+    def forces(self, x: Floats) -> Floats:
+        """Return minus the gradient, (n, 3) [mN]."""
+
+    def force_scale(self) -> float:
+        """Return the largest force of a single element in the last call of `forces` [mN]."""
+
+    def volume_ratio(self, x: Floats) -> Floats:
+        """Return the smallest det F of every element, (e,) [-]."""
+
+    def tangent_values(self, x: Floats, out: Floats, *, definite: bool = False) -> Floats:
+        """Write the values of the tangent in its fixed pattern into `out`, and return it."""
+
+    def factorisation(self, free: Bools) -> Factorisation:
+        """Return what solves with the tangent over the freedoms that are `free`, (n, 3)."""
 
 
 class Term(Protocol):
@@ -67,15 +113,12 @@ class Newton:
     """
 
     def __init__(
-        self, elements: Elements, free: Bools, terms: Sequence[Term] = (), *, tolerance: float = 1e-9, most: int = 60
+        self, elements: System, free: Bools, terms: Sequence[Term] = (), *, tolerance: float = 1e-9, most: int = 60
     ) -> None:
         self.elements, self.terms, self.free = elements, tuple(terms), free
         self.tolerance, self.most = tolerance, most
-        self.factor = Factor(elements, free)
+        self.factor = elements.factorisation(free)
         self.values = np.zeros(len(elements.indices))
-        cells = elements.cells
-        stiff = cells.constant[:, 0] + 2.0 * cells.constant[:, 1]
-        self._stored = float((stiff * cells.weight.sum(axis=1)).sum())
         self.rounding = 0.0
 
     def energy(self, x: Floats, force: Floats) -> float:
@@ -130,7 +173,7 @@ class Newton:
     def _noise(self, x: Floats, force: Floats, value: float) -> float:
         """Return the change of an energy `value` that may be rounding alone [uJ]."""
         work = float((force * (x - self.elements.points)).sum())
-        return 16.0 * EPS * (abs(value) + abs(work)) + 1e-3 * EPS * self._stored
+        return 16.0 * EPS * (abs(value) + abs(work)) + 1e-3 * EPS * self.elements.stiffness_scale
 
     def _advance(self, x: Floats, force: Floats, unbalanced: Floats, value: float, report: Report) -> float | None:
         """Take one step from `x` with energy `value`, in place; return the new energy, None if there is no way down."""
@@ -167,18 +210,16 @@ class Newton:
 
     def lifted(self, x: Floats, move: Floats, force: Floats) -> Floats | None:
         """Return `x` with the fixed freedoms moved by `move` and the others as a linear body would follow, or None."""
-        values = self.tangent(x)
-        pushed = self.elements.matrix(values) @ np.where(self.free, 0.0, move).ravel()
         total, _ = self.forces(x)
-        if not self.factor.factor(values):
+        if not self.factor.factor(self.tangent(x)):
             return None
-        step = self.factor.solve(total + force - pushed.reshape(-1, 3))
+        step = self.factor.solve(total + force, np.where(self.free, 0.0, move))
         there = x + np.where(self.free, step, move)
         return there if np.isfinite(self.elements.energy(there)) else None
 
 
 def newton(
-    elements: Elements,
+    elements: System,
     *,
     fixed: Any,
     values: Any = None,
@@ -248,12 +289,12 @@ def _judge(search: Newton, x: Floats, report: Report, check_definite: bool) -> N
     ratio = search.elements.volume_ratio(x)
     report.least_ratio = float(ratio.min())
     report.inverted = int((ratio <= 0.0).sum())
-    report.valid = report.inverted == 0 or search.elements.law == "linear"
+    report.valid = report.inverted == 0 or search.elements.linear
     if check_definite and search.free.any():
         report.definite = search.factor.factor(search.tangent(x)) and search.factor.definite()
 
 
-def _freedoms(elements: Elements, fixed: Any) -> Bools:
+def _freedoms(elements: System, fixed: Any) -> Bools:
     array = np.asarray(fixed)
     n = len(elements.points)
     if array.dtype != np.bool_ or array.shape not in ((n,), (n, 3)):
@@ -261,7 +302,7 @@ def _freedoms(elements: Elements, fixed: Any) -> Bools:
     return np.ascontiguousarray(np.broadcast_to(array.reshape(n, -1), (n, 3)))
 
 
-def _positions(name: str, value: Any, elements: Elements) -> Floats:
+def _positions(name: str, value: Any, elements: System) -> Floats:
     """Return `value` as checked (n, 3) numbers; None means the rest positions."""
     if value is None:
         return elements.points

@@ -1,0 +1,1 @@
+"""Finite elements as functions of positions: energy, forces and tangent, and the search for equilibrium."""
