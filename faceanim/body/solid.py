@@ -12,7 +12,7 @@ import numpy as np
 from faceanim.body.body import Attachment, Body, Bone, Muscles
 from faceanim.geometry.embedding import Embedding
 from faceanim.geometry.surface import TriMesh
-from faceanim.geometry.volume import TetMesh
+from faceanim.geometry.volume import FACES, TetMesh
 from faceanim.ground.arrays import Bools, Floats, Ints
 from faceanim.ground.errors import UserError
 from faceanim.tissue.material import Material
@@ -39,8 +39,7 @@ class ThinLayer:
         pair[outer] = np.arange(len(outer))
         outside = pair[mesh.tets] >= 0
         on_top = (region == which) & (outside.sum(axis=1) == 3)
-        # the face opposite a corner, seen from outside
-        faces = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])[np.argmin(outside[on_top], axis=1)]
+        faces = FACES[np.argmin(outside[on_top], axis=1)]
         return cls(which, outer, inner, pair[np.take_along_axis(mesh.tets[on_top], faces, axis=1)])
 
 

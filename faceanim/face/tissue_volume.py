@@ -111,7 +111,7 @@ def _grown(face: Face, grain: Grain) -> dict[str, np.ndarray]:
     columns = grow(face, grain.edge, grain.layers, LEAST_QUALITY, half=half)
     twin = np.arange(len(columns.vertex), dtype=np.int32)
     points, tets = stacked(columns.top, columns.foot, columns.wall, columns.triangles, grain.layers)
-    weight = _held(face, columns, grain.layers)
+    weight = bone_shares(face, columns, grain.layers)
     carrier, rigid = carry(face, columns, TetMesh(points, tets), weight, grain.layers, half=half)
     region = _regions(face, columns, TetMesh(points, tets), grain.layers)
     vertex, shortened = columns.vertex, columns.shortened
@@ -156,7 +156,7 @@ def _twins(middle: Bools) -> tuple[Ints, int]:
     return twin, len(middle) + len(side)
 
 
-def _held(face: Face, columns: Columns, layers: int) -> Floats:
+def bone_shares(face: Face, columns: Columns, layers: int) -> Floats:
     """Return the share of each bone in holding each node, (n, 2); zero where it is free."""
     weight = np.zeros((len(columns.vertex), layers + 1, 2))
     skull = face.skull
