@@ -37,6 +37,7 @@ class System(Protocol):
     """What has an energy over positions (n, 3); `points` are the rest positions.
 
     indices : its length is that of the tangent's values   linear : whether the law holds at any deformation
+    barrier : whether it forbids inversion
     stiffness_scale : [uJ] the elastic energy of a body whose strains are all about 1, as a measure of rounding
     """
 
@@ -45,6 +46,9 @@ class System(Protocol):
 
     @property
     def linear(self) -> bool: ...
+
+    @property
+    def barrier(self) -> bool: ...
 
     @property
     def stiffness_scale(self) -> float: ...

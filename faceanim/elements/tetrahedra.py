@@ -162,6 +162,11 @@ class Elements:
         """Whether the law is linear: then it holds, as a mathematical model, at any deformation."""
         return self.law == "linear"
 
+    @property
+    def barrier(self) -> bool:
+        """Whether the law forbids inversion."""
+        return self.law in BARRIER
+
     @cached_property
     def stiffness_scale(self) -> float:
         """The elastic energy of a body whose strains are all about 1 [uJ]."""
