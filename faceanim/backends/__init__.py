@@ -10,6 +10,7 @@ from faceanim.ground.errors import unknown_name
 BACKENDS: dict[str, str] = {
     "mass_spring": "faceanim.backends.mass_spring.solver:SolverMassSpring",
     "finite_elements": "faceanim.backends.finite_elements.solver:SolverFiniteElements",
+    "mixed_fem": "faceanim.backends.mixed_fem.solver:SolverMixedFem",
     "modal_warping": "faceanim.backends.modal_warping.solver:SolverModalWarping",
     "octree_mass_spring": "faceanim.backends.octree_mass_spring.solver:SolverOctreeMassSpring",
 }

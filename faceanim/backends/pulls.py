@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy import sparse
@@ -57,18 +57,34 @@ def carried_by(elements: Elements, skin: Embedding) -> Embedding:
     return Embedding(np.ascontiguousarray(node, dtype=np.int32), np.ascontiguousarray(weight))
 
 
+class Carrier(Protocol):
+    """Elements whose tangent has room for what pulls them; `points` (n, 3) are the rest positions [mm]."""
+
+    points: Floats
+
+    def entries(self, i: Ints, j: Ints) -> Ints:
+        """Return where the blocks of the node pairs are in the tangent's values, (k, 3, 3)."""
+
+
 class Pulls:
     """The muscles of a body on the surface that its elements carry: a `newton.Term`; `dead` are the constant forces."""
 
-    def __init__(self, body: Body, elements: Elements, skin: Embedding) -> None:
+    def __init__(
+        self, body: Body, elements: Carrier, skin: Embedding, *, mass: Floats, nodes: int | None = None
+    ) -> None:
+        """Compile the tables.
+
+        mass : (n,) [kg] on which gravity acts   nodes : how many there are for `skin` to name, None = those of `elements`
+        """
         n = len(body.surface.points)
         self.elements = elements
         self.skin = skin
-        self.matrix = skin.matrix(len(elements.points))
+        self.matrix = skin.matrix(len(elements.points) if nodes is None else nodes)
         self._spread = self.matrix.T.tocsr()
         self.fibres = fibre_table(body.muscles, n)
         e = len(self.fibres.muscle)
         self.aimed = Aimed(np.zeros(n + 1, dtype=np.int32), np.zeros((e, 3)), np.zeros(e), np.zeros(e))
+        self.mass = mass
         self.dead = np.zeros_like(elements.points)
         self._force = np.zeros((n, 4))
         self._block = np.zeros((n, 6))
@@ -86,34 +102,51 @@ class Pulls:
         self._row, self._product = row, product[row, pair]
         self._at = self.elements.entries(i, j).reshape(-1, 9)
 
+    def surface(self, x: Floats) -> Floats:
+        """Return where the surface vertices are, (n_surface, 3) [mm]."""
+        return np.asarray(self.matrix @ x)
+
+    def spread(self, x: Floats, force: Floats) -> Floats:
+        """Return forces on the surface vertices, (n_surface, 3), as forces on the nodes, (n, 3) [mN]."""
+        return np.asarray(self._spread @ force)
+
+    @property
+    def acts(self) -> bool:
+        """Whether any muscle pulls now."""
+        return bool(self.aimed.first[-1])
+
     def apply(self, control: Control) -> None:
         """Take the activations, poses and loads of `control`; they hold until the next call."""
         muscles.aim(self.fibres, control.activation, control.bone_pose, self.aimed)
-        self.dead[:] = self.elements.gravity_mass[:, None] * control.gravity
+        self.dead[:] = self.mass[:, None] * control.gravity
         if control.force is not None:
             self.dead += self._spread @ control.force
 
     def energy(self, x: Floats) -> float:
         """Return the muscles' energy [uJ]."""
-        if not len(self._pulled):
+        if not self.acts:
             return 0.0
-        return float(muscles.fibre_energy(self.matrix @ x, self.aimed, len(self._force)))
+        return float(muscles.fibre_energy(self.surface(x), self.aimed, len(self._force)))
 
     def forces(self, x: Floats) -> Floats:
         """Return the muscles' forces on the nodes, (n, 3) [mN]."""
-        if not len(self._pulled):
+        if not self.acts:
             return np.zeros_like(x)
         self._force[:] = 0.0
-        muscles.fibre_force(self.matrix @ x, self.aimed, len(self._force), self._force)
-        return np.asarray(self._spread @ self._force[:, :3])
+        muscles.fibre_force(self.surface(x), self.aimed, len(self._force), self._force)
+        return self.spread(x, self._force[:, :3])
+
+    def _blocks(self, x: Floats) -> Floats:
+        """Return the Hessians of the pulls on the pulled vertices, row by row, (p, 9) [mN/mm]."""
+        self._block[:] = 0.0
+        muscles.fibre_blocks(self.surface(x), self.aimed, len(self._force), self._block)
+        return self._block[self._pulled][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
 
     def add_tangent(self, x: Floats, values: Floats) -> None:
         """Add w_a w_b F (I - d d^T / r^2) / r for all nodes a, b of each pulled vertex."""
-        if not len(self._pulled):
+        if not self.acts:
             return
-        self._block[:] = 0.0
-        muscles.fibre_blocks(self.matrix @ x, self.aimed, len(self._force), self._block)
-        full = self._block[self._pulled][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+        full = self._blocks(x)
         values += np.bincount(self._at.ravel(), (self._product[:, None] * full[self._row]).ravel(), len(values))
 
 
@@ -134,5 +167,5 @@ class Quadratic:
         return np.asarray(-(self.matrix @ (x - self.centre).ravel())).reshape(-1, 3)
 
     def add_tangent(self, x: Floats, values: Floats) -> None:
-        """Add A, which has the elements' pattern."""
-        values += self.matrix.data
+        """Add A, which has the pattern of the elements' own freedoms, the first of the values."""
+        values[: len(self.matrix.data)] += self.matrix.data

@@ -59,9 +59,12 @@ def _touching(adjacent: sparse.csr_matrix, nodes: Ints, others: Ints, mark: Floa
 
 
 class Patterned(Protocol):
-    """A matrix over the freedoms of nodes, in a fixed pattern; `node_pattern` (n, n) says which nodes are coupled."""
+    """A matrix over the freedoms of nodes, in a fixed pattern; `node_pattern` (n, n) says which nodes are coupled.
 
-    points: Floats
+    places : (n, 3) where the nodes are, for the order of elimination
+    """
+
+    places: Floats
     indices: Ints
     node_pattern: sparse.csr_matrix
 
@@ -81,7 +84,7 @@ class Factor:
         self._values: Floats = np.zeros(len(elements.indices))
         nodes = np.flatnonzero(self.free.reshape(-1, 3).any(axis=1))
         pattern = elements.node_pattern[nodes][:, nodes]
-        inner = nodes[dissected(elements.points[nodes], pattern)]
+        inner = nodes[dissected(elements.places[nodes], pattern)]
         rows = (3 * inner[:, None] + np.arange(3)).ravel()
         self.rows = rows[self.free[rows]]
         numbered = elements.matrix(np.arange(1.0, len(elements.indices) + 1.0))

@@ -73,7 +73,10 @@ class System(Protocol):
 
 
 class Term(Protocol):
-    """A part of the energy besides the elements' and constant forces."""
+    """A part of the energy besides the elements' and constant forces.
+
+    One whose Hessian can be indefinite may also offer `add_definite_tangent`, with negative eigenvalues raised to zero.
+    """
 
     def energy(self, x: Floats) -> float:
         """Return the energy [uJ]."""
@@ -147,7 +150,8 @@ class Newton:
         """Return the values of the whole tangent in the elements' pattern."""
         values = self.elements.tangent_values(x, self.values, definite=definite)
         for term in self.terms:
-            term.add_tangent(x, values)
+            add = getattr(term, "add_definite_tangent", term.add_tangent) if definite else term.add_tangent
+            add(x, values)
         # what is left of a balance when positions are rounded
         self.rounding = 4.0 * EPS * float(np.abs(values).max() * np.abs(x).max())
         return values

@@ -5,9 +5,9 @@ This layer knows no bones, muscles or time; verification uses it directly.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy import sparse
@@ -27,19 +27,23 @@ LAWS = {
     "corotational": hyperelastic.COROTATIONAL,
     "stvk": hyperelastic.STVK,
     "mooney_rivlin": hyperelastic.MOONEY_RIVLIN,
+    "tension": hyperelastic.TENSION,
+    "stvk_barrier": hyperelastic.STVK_BARRIER,
 }
 """Name of each elastic law -> its number in the kernels; the energies are in `kernels.hyperelastic`."""
-BARRIER = ("neo_hookean", "mooney_rivlin")
+BARRIER = ("neo_hookean", "mooney_rivlin", "tension", "stvk_barrier")
 """Laws whose energy is infinite where an element is inverted."""
 
 
 class Elements:
     """Linear (`order` 1) or quadratic (2) tetrahedra of elastic materials under one law.
 
-    points : (n, 3) rest positions [mm]: the nodes of `mesh`, then, for order 2, one on each edge
+    points : (n, 3) rest positions [mm]: the nodes of `mesh`, then, for order 2, one on each edge, then `extra` rows of 0
     node : (e, 4 | 10)   edges : (k, 2) corners beside each mid-edge node, empty for order 1
     Positions `x` are (n, 3) [mm]. Quadratic elements may be curved: `middle` (k, 3) moves the mid-edge nodes at rest.
     """
+
+    laws: ClassVar[Mapping[str, int]] = LAWS
 
     def __init__(
         self,
@@ -52,28 +56,43 @@ class Elements:
         quadrature: int | None = None,
         middle: Any = None,
         coupled: Ints | None = None,
+        extra: int = 0,
     ) -> None:
         """Compile the tables.
 
         materials, region : one material, or several and the index (e,) of each element's
         quadrature : points for the energy, 1, 4 or 14; None = 1 for linear, 4 for quadratic elements
         coupled : (k, 2) further pairs of nodes that the tangent's pattern must have room for, both ways
+        extra : further nodes after the mesh's that only other terms touch, such as the rotations of a shell; their rest
+        value is 0, and each has room in the pattern for itself and for what `coupled` names
         Raises `UserError` for an unknown law, a wrong order or region, and for elements inverted or flat at rest.
         """
-        if law not in LAWS:
-            raise unknown_name("elastic law", law, LAWS)
+        if law not in self.laws:
+            raise unknown_name("elastic law", law, self.laws)
         if order not in (1, 2):
             raise UserError(f"order = {order}: elements are linear (1) or quadratic (2)")
         mesh.reject_bad()
         self.mesh, self.order, self.law = mesh, order, law
-        self._law = LAWS[law]
+        self._law = self.laws[law]
         self._quadrature = (1 if order == 1 else 4) if quadrature is None else quadrature
         self.materials = (materials,) if isinstance(materials, Material) else tuple(materials)
+        self.extra = extra
+        self._reject_unfit()
         self.region = self._regions(region)
         self._nodes(middle)
         self.cells = self._cells()
         self._allocate()
         self._pattern(coupled)
+
+    def _reject_unfit(self) -> None:
+        if self.extra < 0:
+            raise UserError(f"extra = {self.extra}: the number of further nodes must not be negative")
+        for material in self.materials:
+            if self.law == "tension" and material.mooney > 0:
+                raise UserError(
+                    f"material {material.name!r}: the law 'tension' needs mooney <= 0 (c01 <= 0), not {material.mooney}; "
+                    "choose 'mooney_rivlin', which is stable for c01 >= 0"
+                )
 
     def _regions(self, region: Any) -> Ints:
         e = len(self.mesh.tets)
@@ -95,6 +114,8 @@ class Elements:
             self.points = np.concatenate([mesh.points, halfway])
         elif middle is not None:
             raise UserError("middle: linear elements have no mid-edge nodes; choose order 2")
+        if self.extra:
+            self.points = np.concatenate([self.points, np.zeros((self.extra, 3))])
 
     def rule(self, points: int) -> tuple[Floats, Floats, Floats]:
         """Return shape values (q, a), gradients (e, q, a, 3) [1/mm] and weights (e, q) [mm^3] of a rule."""
@@ -109,8 +130,12 @@ class Elements:
         gradient = np.einsum("qaj,eqji->eqai", local, np.linalg.inv(jacobian))
         return shapes.shape_values(self.order, at, shapes.TET_EDGES), gradient, weight
 
+    def _constants(self) -> Floats:
+        """Return lambda, mu, c10, c01 and kappa of every material, (r, 5) [kPa], as the kernels take them."""
+        return np.array([(m.lame_first, m.shear_modulus, m.c10, m.c01, m.bulk_modulus) for m in self.materials])
+
     def _cells(self) -> solids.Cells:
-        constant = np.array([(m.lame_first, m.shear_modulus, m.c10, m.c01, m.bulk_modulus) for m in self.materials])
+        constant = self._constants()
         _, gradient, weight = self.rule(self._quadrature)
         tables = (self.node, gradient, weight, constant[self.region])
         return solids.Cells(*(frozen(np.ascontiguousarray(table)) for table in tables))
@@ -128,21 +153,33 @@ class Elements:
         e, a = self.node.shape
         n = len(self.points)
         key = (self.node[:, :, None].astype(np.int64) * n + self.node[:, None, :]).ravel()
-        extra = np.zeros(0, dtype=np.int64)
+        own = np.arange(n - self.extra, n, dtype=np.int64)
+        further = [own * n + own]
         if coupled is not None and len(coupled):
-            pairs = np.concatenate([coupled, coupled[:, ::-1]]).astype(np.int64)
-            extra = pairs[:, 0] * n + pairs[:, 1]
-        pairs_known = np.unique(np.concatenate([key, extra]))
+            both = ints("coupled", coupled, None, 2, below=n).astype(np.int64)
+            further += [both[:, 0] * n + both[:, 1], both[:, 1] * n + both[:, 0]]
+        pairs_known = np.unique(np.concatenate([key, *further]))
         pair = np.searchsorted(pairs_known, key).astype(np.int32)
         slots = grouped(pair, np.arange(len(key), dtype=np.int32), len(pairs_known))
-        own = grouped(self.node.ravel(), np.arange(e * a, dtype=np.int32), n)
+        users = grouped(self.node.ravel(), np.arange(e * a, dtype=np.int32), n)
         row, column = pairs_known // n, (pairs_known % n).astype(np.int32)
         first = np.zeros(n + 1, dtype=np.int32)
         np.cumsum(np.bincount(row, minlength=n), out=first[1:])
-        self._gather = solids.Gather(*map(frozen, (own.start, own.item, first, slots.start, slots.item)))
+        self._gather = solids.Gather(*map(frozen, (users.start, users.item, first, slots.start, slots.item)))
         self._pairs = pairs_known
         self.node_pattern = sparse.csr_matrix((np.ones(len(column)), column, first), shape=(n, n))
         self.indptr, self.indices = _scalar_pattern(first, column)
+        self.places = self._places()
+
+    def _places(self) -> Floats:
+        """Return where each node is for the order of elimination, (n, 3): further nodes are amid what they couple."""
+        own = len(self.points) - self.extra
+        if not self.extra:
+            return self.points
+        beside = self.node_pattern[own:, :own]
+        count = np.asarray(beside.sum(axis=1)).reshape(-1, 1)
+        amid = np.asarray(beside @ self.points[:own]) / np.maximum(count, 1.0)
+        return np.concatenate([self.points[:own], amid])
 
     @property
     def size(self) -> int:
@@ -160,7 +197,7 @@ class Elements:
     @property
     def linear(self) -> bool:
         """Whether the law is linear: then it holds, as a mathematical model, at any deformation."""
-        return self.law == "linear"
+        return self._law == hyperelastic.LINEAR
 
     @property
     def barrier(self) -> bool:

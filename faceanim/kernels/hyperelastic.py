@@ -8,6 +8,8 @@ NEO_HOOKEAN    mu/2 (I1 - 3 - 2 ln J) + lambda/2 (ln J)^2; infinite for J <= 0
 COROTATIONAL   mu |F - R|^2 + lambda/2 (tr(R^T F) - 3)^2, R the rotation nearest to F (det R = +1, also for J < 0)
 STVK           mu E : E + lambda/2 (tr E)^2, E = (C - I)/2; softens when compressed and lets elements invert
 MOONEY_RIVLIN  c10 (J^(-2/3) I1 - 3) + c01 (J^(-4/3) I2 - 3) + kappa/2 (J - 1)^2; infinite for J <= 0
+TENSION        f(J^(-2/3) I1 - 3) + kappa/2 (J - 1)^2, f of `kernels.tension`, c01 <= 0; infinite for J <= 0
+STVK_BARRIER   mu E : E + lambda/2 (ln J)^2: STVK whose volume term is a barrier; infinite for J <= 0
 
 Bonet & Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008, chapters 6 and 8; for the derivative of R
 see McAdams et al., Efficient elasticity for character skinning with contact and collisions, 2011.
@@ -18,12 +20,15 @@ from __future__ import annotations
 import math
 
 from faceanim.ground.jit import kernel
+from faceanim.kernels.tension import tension_curvature, tension_energy, tension_slope
 
 LINEAR = 0
 NEO_HOOKEAN = 1
 COROTATIONAL = 2
 STVK = 3
 MOONEY_RIVLIN = 4
+TENSION = 5
+STVK_BARRIER = 6
 
 SWEEPS = 40
 """Most sweeps of a Jacobi iteration; five to ten are usual."""
@@ -233,11 +238,35 @@ def energy_density(law, F, c, work):
     if law == NEO_HOOKEAN:
         logarithm = math.log1p(change)
         return 0.5 * mu * (stretch_change(F) - 2.0 * logarithm) + 0.5 * lame * logarithm * logarithm
+    if law == STVK_BARRIER:
+        logarithm = math.log1p(change)
+        return mu * green_squared(F) + 0.5 * lame * logarithm * logarithm
+    if law == TENSION:
+        return tension_energy(isochoric_change(F, change), c[2], c[3]) + 0.5 * c[4] * change * change
     I1 = squared(F)
     cube = (1.0 + change) ** (-2.0 / 3.0)
     return (
         c[2] * (cube * I1 - 3.0) + c[3] * (cube * cube * second_invariant(F, I1) - 3.0) + 0.5 * c[4] * change * change
     )
+
+
+@kernel(inline=True)
+def isochoric_change(F, change):
+    """Return J^(-2/3) I1 - 3 for J = 1 + `change` without the loss of digits near F = I."""
+    shrunk = math.expm1(-2.0 / 3.0 * math.log1p(change))
+    more = stretch_change(F)
+    return more + shrunk * (3.0 + more)
+
+
+@kernel(inline=True)
+def green_squared(F):
+    """Return E : E of Green's strain E = (C - I) / 2."""
+    total = 0.0
+    for i in range(3):
+        for j in range(3):
+            e = 0.5 * (F[0, i] * F[0, j] + F[1, i] * F[1, j] + F[2, i] * F[2, j] - (1.0 if i == j else 0.0))
+            total += e * e
+    return total
 
 
 @kernel
@@ -281,6 +310,17 @@ def stress(law, F, c, work, P):
         for i in range(3):
             for j in range(3):
                 P[i, j] = F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j]
+    elif law == STVK_BARRIER:
+        S = work[0]
+        G = work[1]
+        _second_stress(F, 0.0, mu, S)
+        inverse_transpose(F, G)
+        s = lame * math.log1p(volume_change(F))
+        for i in range(3):
+            for j in range(3):
+                P[i, j] = F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j] + s * G[i, j]
+    elif law == TENSION:
+        _tension_stress(F, c, work, P)
     else:
         _mooney_stress(F, c, work, P)
 
@@ -353,8 +393,20 @@ def tangent(law, F, c, work, A):
         _corotational_tangent(F, lame, mu, work, A)
     elif law == STVK:
         _stvk_tangent(F, lame, mu, work, A)
+    elif law == STVK_BARRIER:
+        _stvk_tangent(F, 0.0, mu, work, A)
+        G = work[0]
+        inverse_transpose(F, G)
+        s = lame * math.log1p(volume_change(F))
+        for i in range(3):
+            for j in range(3):
+                for k in range(3):
+                    for l in range(3):
+                        A[3 * i + j, 3 * k + l] += lame * G[i, j] * G[k, l] - s * G[i, l] * G[k, j]
+    elif law == TENSION:
+        _tension_tangent(F, c, work, A)
     else:
-        _mooney_tangent(F, c, work, A)
+        _mooney_tangent(F, c[2], c[3], c[4], work, A)
 
 
 @kernel
@@ -403,7 +455,42 @@ def _stvk_tangent(F, lame, mu, work, A):
 
 
 @kernel
-def _mooney_tangent(F, c, work, A):
+def _tension_stress(F, c, work, P):
+    """Write P = f' dI/dF + kappa (J - 1) J G with I = J^(-2/3) I1."""
+    G = work[0]
+    J = inverse_transpose(F, G)
+    change = volume_change(F)
+    a = tension_slope(isochoric_change(F, change), c[2], c[3]) * J ** (-2.0 / 3.0)
+    s = c[4] * change * J - 2.0 / 3.0 * a * squared(F)
+    for i in range(3):
+        for j in range(3):
+            P[i, j] = 2.0 * a * F[i, j] + s * G[i, j]
+
+
+@kernel
+def _tension_tangent(F, c, work, A):
+    """Write A: that of the Mooney-Rivlin law with the constants f' and 0, plus f'' dI/dF (x) dI/dF."""
+    change = volume_change(F)
+    over = isochoric_change(F, change)
+    _mooney_tangent(F, tension_slope(over, c[2], c[3]), 0.0, c[4], work, A)
+    D = work[1]
+    b = 2.0 * (1.0 + change) ** (-2.0 / 3.0)
+    third = squared(F) / 3.0
+    for i in range(3):
+        for j in range(3):
+            D[i, j] = b * (F[i, j] - third * work[0, i, j])
+    bend = tension_curvature(over, c[2], c[3])
+    for i in range(3):
+        for j in range(3):
+            t = bend * D[i, j]
+            for k in range(3):
+                for l in range(3):
+                    A[3 * i + j, 3 * k + l] += t * D[k, l]
+
+
+@kernel
+def _mooney_tangent(F, c10, c01, kappa, work, A):
+    """Write A and leave G in `work[0]`."""
     G = work[0]
     C = work[1]
     H = work[2]
@@ -411,11 +498,11 @@ def _mooney_tangent(F, c, work, A):
     I1 = squared(F)
     I2 = second_invariant(F, I1)
     _invariant_gradient(F, I1, C, H)
-    a = c[2] * J ** (-2.0 / 3.0)
-    b = c[3] * J ** (-4.0 / 3.0)
+    a = c10 * J ** (-2.0 / 3.0)
+    b = c01 * J ** (-4.0 / 3.0)
     change = volume_change(F)
-    turned = 2.0 / 3.0 * a * I1 + 4.0 / 3.0 * b * I2 - c[4] * change * J
-    outer = 4.0 / 9.0 * a * I1 + 16.0 / 9.0 * b * I2 + c[4] * (2.0 * change + 1.0) * J
+    turned = 2.0 / 3.0 * a * I1 + 4.0 / 3.0 * b * I2 - kappa * change * J
+    outer = 4.0 / 9.0 * a * I1 + 16.0 / 9.0 * b * I2 + kappa * (2.0 * change + 1.0) * J
     for i in range(3):
         for k in range(3):
             B = F[i, 0] * F[k, 0] + F[i, 1] * F[k, 1] + F[i, 2] * F[k, 2]

@@ -13,7 +13,9 @@ class Material:
     """An isotropic solid, the same at small strain under every elastic law.
 
     density : [kg/mm^3]   young_modulus : [kPa]   poisson_ratio : [-] in (-1, 1/2)
-    mooney : [-] share of the shear modulus that the Mooney-Rivlin law gives to its second invariant, c01 / (c10 + c01)
+    mooney : [-] share of the shear modulus that the Mooney-Rivlin law gives to its second invariant, c01 / (c10 + c01),
+    at most 1. Below 0 (c01 < 0, as fits of tension curves give) that law is elliptic only below `stretch_limit`; the
+    law "tension" has the same tension curve and is stable everywhere (`tissue.stability`).
     """
 
     name: str
@@ -27,7 +29,7 @@ class Material:
             ("density", self.density > 0, "positive"),
             ("young_modulus", self.young_modulus > 0, "positive"),
             ("poisson_ratio", -1 < self.poisson_ratio < 0.5, "above -1 and below 0.5 (0.499 is nearly incompressible)"),
-            ("mooney", 0 <= self.mooney <= 1, "in 0..1"),
+            ("mooney", self.mooney <= 1, "at most 1 (c10 >= 0); negative values mean c01 < 0"),
         ):
             value = getattr(self, name)
             if not (math.isfinite(value) and sound):
@@ -35,12 +37,18 @@ class Material:
 
     @classmethod
     def mooney_rivlin(cls, name: str, density: float, c10: float, c01: float, bulk_modulus: float) -> Material:
-        """Return the material with these Mooney-Rivlin constants and bulk modulus [kPa]."""
+        """Return the material with these Mooney-Rivlin constants and bulk modulus [kPa]; c01 may be negative.
+
+        Raises `UserError` if c10 + c01 <= 0 (unstable at rest: no shear stiffness), c10 < 0 or bulk_modulus <= 0.
+        """
         shear = 2.0 * (c10 + c01)
-        if not shear > 0 or not bulk_modulus > 0:
-            raise UserError(
-                f"material {name!r}: c10 + c01 = {c10 + c01} and bulk_modulus = {bulk_modulus} must be positive"
-            )
+        for what, value, sound, rule in (
+            ("c10 + c01", c10 + c01, shear > 0, "positive: half the shear modulus at rest, else unstable there"),
+            ("c10", c10, c10 >= 0, "not negative"),
+            ("bulk_modulus", bulk_modulus, bulk_modulus > 0, "positive"),
+        ):
+            if not (math.isfinite(value) and sound):
+                raise UserError(f"material {name!r}: {what} = {value} kPa must be finite and {rule}")
         young = 9.0 * bulk_modulus * shear / (3.0 * bulk_modulus + shear)
         poisson = (3.0 * bulk_modulus - 2.0 * shear) / (2.0 * (3.0 * bulk_modulus + shear))
         return cls(name, density, young, poisson, 2.0 * c01 / shear)
@@ -70,3 +78,11 @@ class Material:
     def c01(self) -> float:
         """Mooney-Rivlin constant of the second invariant [kPa]."""
         return 0.5 * self.shear_modulus * self.mooney
+
+    @property
+    def stretch_limit(self) -> float:
+        """Principal stretch at which the incompressible Mooney-Rivlin law loses its ellipticity, inf if c01 >= 0 [-].
+
+        It is elliptic where c10 + c01 l_i^2 > 0 for i = 1, 2, 3.
+        """
+        return math.sqrt(-self.c10 / self.c01) if self.c01 < 0 else math.inf

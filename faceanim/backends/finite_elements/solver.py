@@ -36,7 +36,7 @@ class SolverFiniteElements(SolverNewton):
             order=self.options.order, law=self.options.law, coupled=coupled(body, skin),
         )  # fmt: skip
         self._hold()
-        self.pulls = Pulls(body, self.elements, carried_by(self.elements, skin))
+        self.pulls = Pulls(body, self.elements, carried_by(self.elements, skin), mass=self.elements.gravity_mass)
         self._matrices()
 
     def _hold(self) -> None:

@@ -1,0 +1,233 @@
+"""The skin of a solid as a shell that rides on the flesh beneath, in the flesh's own freedoms and its own rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial.transform import Rotation
+
+from faceanim.backends.pulls import Pulls
+from faceanim.body.body import Body
+from faceanim.body.control import Control
+from faceanim.body.solid import Solid, ThinLayer
+from faceanim.elements.shells import Sheet, Shells
+from faceanim.elements.tetrahedra import Elements
+from faceanim.geometry.embedding import Embedding
+from faceanim.geometry.surface import TriMesh
+from faceanim.geometry.volume import TetMesh
+from faceanim.ground.arrays import Floats, Ints
+from faceanim.ground.errors import UserError
+from faceanim.kernels import muscles
+from faceanim.tissue.material import Material
+
+DRILLING = 0.05
+"""Share of the shear stiffness that holds a node's turn about the normal: muscles pull at arms that lean, and turn it."""
+THINNEST = 0.1
+"""Least thickness of a shell [mm], where the layer's columns lean steeply."""
+
+
+class Skin:
+    """A solid divided into the flesh beneath its layer and the layer as a shell.
+
+    Positions `x` (k + m, 3): the k nodes of `flesh`, then the rotation vectors of the layer's m pairs. The outer nodes of
+    the layer are carried: x_outer = x_inner + R arm, and the shell's middle lies half-way.
+
+    used : (k,) nodes of the solid that the flesh has   carrier : (m,) rows of the inner nodes   arm : (m, 3) [mm]
+    """
+
+    def __init__(self, solid: Solid, layer: ThinLayer, material: Material, law: str) -> None:
+        mesh = solid.mesh
+        inside = solid.region != layer.region
+        self.used = np.unique(mesh.tets[inside]).astype(np.int32)
+        row = np.full(len(mesh.points), -1, dtype=np.int32)
+        row[self.used] = np.arange(len(self.used))
+        if (row[layer.inner] < 0).any() or (row[layer.outer] >= 0).any():
+            raise UserError("the skin's layer must lie on other flesh, pair by pair; this one cannot become a shell")
+        self.flesh = TetMesh(mesh.points[self.used], row[mesh.tets[inside]])
+        self.region = solid.region[inside]
+        self.layer, self.row = layer, row
+        self.carrier = row[layer.inner]
+        self.arm = mesh.points[layer.outer] - mesh.points[layer.inner]
+        self.rows = np.concatenate([self.carrier, len(self.used) + np.arange(len(self.arm))]).astype(np.int32)
+        thickness, offset = self._middle()
+        sheets = [sheet_of(material, law, float(h)) for h in thickness]
+        every = np.arange(len(sheets), dtype=np.int32)
+        self.shells = Shells(mesh.points[layer.inner], layer.triangles, sheets, every, offset=offset)
+        self.node = self.rows[self.shells.node]
+
+    def _middle(self) -> tuple[Floats, Floats]:
+        """Return the thickness of the layer at each triangle, (t,), and the way from the inner nodes to its middle, (m, 3).
+
+        The way is along the normal: a leaning arm would let the membrane turn the nodes about it, which hardly resist.
+        """
+        surface = TriMesh(self.flesh.points[self.carrier] + 0.5 * self.arm, self.layer.triangles)
+        height = np.maximum(np.einsum("mi,mi->m", self.arm, surface.vertex_normals), THINNEST)
+        return height[self.layer.triangles].mean(axis=1), 0.5 * height[:, None] * surface.vertex_normals
+
+    def full(self, x: Floats) -> Floats:
+        """Return where all nodes of the solid are, (n, 3) [mm]."""
+        out = np.empty((len(self.row), 3))
+        out[self.used] = x[: len(self.used)]
+        out[self.layer.outer] = self.shells.attached(x[self.rows], self.arm)
+        return out
+
+    def folded(self, x: Floats, force: Floats) -> Floats:
+        """Return forces on all nodes of the solid, (n, 3) [mN], as forces and moments on the rows of `x`."""
+        out = np.zeros_like(x)
+        out[: len(self.used)] = force[self.used]
+        np.add.at(out, self.rows, self.shells.attached_forces(x[self.rows], self.arm, force[self.layer.outer]))
+        return out
+
+    @staticmethod
+    def turned(weight: Floats, pose: Floats) -> Floats:
+        """Return the rotation vectors, (k, 3), of what the bones at `pose` hold by `weight` (k, n_bone)."""
+        turn = np.einsum("kb,bij->kij", weight, pose[:, :3, :3])
+        return np.asarray(Rotation.from_matrix(turn).as_rotvec())
+
+    @property
+    def coupled(self) -> Ints:
+        """Pairs of rows that the shell couples, (p, 2)."""
+        return pairs(self.node)
+
+
+def sheet_of(material: Material, law: str, thickness: float) -> Sheet:
+    """Return a sheet of a tissue; under "linear" and "neo_hookean" its first constant is the whole shear modulus."""
+    half = 0.5 * material.shear_modulus
+    c10, c01 = (half, 0.0) if law in ("linear", "neo_hookean") else (material.c10, material.c01)
+    return Sheet(law, thickness, material.young_modulus, material.poisson_ratio, c10, c01, DRILLING)
+
+
+def pairs(node: Ints) -> Ints:
+    """Return all pairs within each row of `node` (t, a), (t a^2, 2)."""
+    a = node.shape[1]
+    return np.unique(np.stack([np.repeat(node, a, axis=1).ravel(), np.tile(node, (1, a)).ravel()], axis=1), axis=0)
+
+
+class ShellTerm:
+    """The energy of a shell: a `newton.Term` of the system that has its rows."""
+
+    def __init__(self, skin: Skin, system: Elements) -> None:
+        self.skin, self.shells = skin, skin.shells
+        node = skin.node
+        i, j = np.repeat(node, 6, axis=1).ravel(), np.tile(node, (1, 6)).ravel()
+        self._at = system.entries(i, j).ravel()
+
+    def energy(self, x: Floats) -> float:
+        """Return the energy [uJ]."""
+        return float(self.shells.energies(x[self.skin.rows]).sum())
+
+    def forces(self, x: Floats) -> Floats:
+        """Return minus its gradient, (k + m, 3): forces [mN] and moments [mN mm]."""
+        part = self.shells.forces(x[self.skin.rows])
+        out = np.empty_like(x)
+        for i in range(3):
+            out[:, i] = np.bincount(self.skin.node.ravel(), part[:, :, i].ravel(), len(x))
+        return out
+
+    def add_tangent(self, x: Floats, values: Floats) -> None:
+        """Add its Hessian."""
+        self._add(x, values, definite=False)
+
+    def add_definite_tangent(self, x: Floats, values: Floats) -> None:
+        """Add its Hessian with the negative eigenvalues of every triangle raised to zero."""
+        self._add(x, values, definite=True)
+
+    def _add(self, x: Floats, values: Floats, *, definite: bool) -> None:
+        block = self.shells.stiffnesses(x[self.skin.rows], definite=definite)
+        split = block.reshape(-1, 6, 3, 6, 3).transpose(0, 1, 3, 2, 4)
+        values += np.bincount(self._at, split.ravel(), len(values))
+
+
+class ShellPulls(Pulls):
+    """The muscles of a body whose skin is a shell: as `Pulls`, through what the shell carries."""
+
+    def __init__(self, body: Body, solid: Solid, skin: Skin, system: Elements) -> None:
+        self.shell_skin = skin
+        self.force: Floats | None = None
+        mass = node_mass(solid, skin, len(system.points))
+        super().__init__(body, system, solid.skin, mass=mass, nodes=len(solid.mesh.points))
+
+    def surface(self, x: Floats) -> Floats:
+        """Return where the surface vertices are, (n_surface, 3) [mm]."""
+        return np.asarray(self.matrix @ self.shell_skin.full(x))
+
+    def spread(self, x: Floats, force: Floats) -> Floats:
+        """Return forces on the surface vertices as forces and moments on the rows of `x`."""
+        return self.shell_skin.folded(x, np.asarray(self._spread @ force))
+
+    def _places(self) -> None:
+        """Find which rows carry each pulled vertex, and where their blocks go in the tangent."""
+        self._pulled = np.flatnonzero(np.diff(self.fibres.start)).astype(np.int32)
+        vertex, row, weight, pair = carried_rows(self.shell_skin, self.skin, self._pulled)
+        self._weight, self._pair = weight, pair
+        first, second = joined(vertex)
+        self._first, self._second, self._vertex = first, second, vertex[first]
+        self._at = self.elements.entries(row[first], row[second])
+
+    def apply(self, control: Control) -> None:
+        """Take the activations, poses and loads of `control`; they hold until the next call."""
+        muscles.aim(self.fibres, control.activation, control.bone_pose, self.aimed)
+        self.dead[:] = self.mass[:, None] * control.gravity
+        self.force = control.force
+
+    def energy(self, x: Floats) -> float:
+        """Return the energy of muscles and surface forces [uJ]."""
+        if self.force is None:
+            return super().energy(x)
+        return super().energy(x) - float((self.force * (self.surface(x) - self.surface(self.elements.points))).sum())
+
+    def forces(self, x: Floats) -> Floats:
+        """Return their forces and moments on the rows, (k + m, 3)."""
+        out = super().forces(x)
+        return out if self.force is None else out + self.spread(x, self.force)
+
+    def add_tangent(self, x: Floats, values: Floats) -> None:
+        """Add the Hessian but for what turning adds to the lever arms: G_a^T H G_b for all rows a, b of each vertex."""
+        if not self.acts:
+            return
+        block = self._blocks(x).reshape(-1, 3, 3)
+        slope = self.shell_skin.shells.attached_slopes(x[self.shell_skin.rows], self.shell_skin.arm)
+        every = np.concatenate([slope, np.eye(3)[None]])[self._pair] * self._weight[:, None, None]
+        part = np.einsum(
+            "kji,kjl,klm->kim", every[self._first], block[self._vertex], every[self._second], optimize=True
+        )
+        values += np.bincount(self._at.ravel(), part.ravel(), len(values))
+
+
+def node_mass(solid: Solid, skin: Skin, rows: int) -> Floats:
+    """Return the mass of each row, (rows,) [kg]: what the outer nodes have is on the inner ones, rotations have none."""
+    out = np.zeros(rows)
+    out[: len(skin.used)] = solid.node_mass[skin.used]
+    np.add.at(out, skin.carrier, solid.node_mass[skin.layer.outer])
+    return out
+
+
+def carried_rows(skin: Skin, surface: Embedding, vertex: Ints) -> tuple[Ints, Ints, Floats, Ints]:
+    """Return what carries the surface vertices `vertex`: place in that list, row, weight, and pair of the layer or -1.
+
+    A vertex on an outer node is carried by the inner node's row and by the row of the pair's rotation.
+    """
+    node, weight = surface.node[vertex], surface.weight[vertex]
+    at, k = np.nonzero(weight)
+    node, weight = node[at, k], weight[at, k]
+    outer = np.full(len(skin.row), -1, dtype=np.int32)
+    outer[skin.layer.outer] = np.arange(len(skin.layer.outer))
+    pair = outer[node]
+    on_skin = pair >= 0
+    row = np.where(on_skin, skin.carrier[pair], skin.row[node])
+    turn = len(skin.used) + pair[on_skin]
+    none = np.full(len(node), -1, dtype=np.int32)
+    return (
+        np.concatenate([at, at[on_skin]]).astype(np.int32),
+        np.concatenate([row, turn]).astype(np.int32),
+        np.concatenate([weight, weight[on_skin]]),
+        np.concatenate([none, pair[on_skin]]),
+    )
+
+
+def joined(group: Ints) -> tuple[Ints, Ints]:
+    """Return all ordered pairs of items that have the same `group` (k,), 2 x (p,)."""
+    k = len(group)
+    member = sparse.coo_matrix((np.ones(k), (np.arange(k), group))).tocsr()
+    both = (member @ member.T).tocoo()
+    return both.row.astype(np.int32), both.col.astype(np.int32)
