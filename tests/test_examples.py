@@ -20,7 +20,7 @@ def main_of(name: str) -> Any:
 def test_every_example_is_tested() -> None:
     """A script that is added gets a test below."""
     named = {path.stem for path in EXAMPLES.glob("*.py")}
-    assert named == {"bar_bending", "twist_and_drag", "octree_block", "face_backends"}
+    assert named == {"bar_bending", "twist_and_drag", "octree_block", "face_backends", "muscle_blocks"}
 
 
 @pytest.mark.slow
@@ -54,3 +54,12 @@ def test_one_face_by_every_backend(tmp_path: Path) -> None:
     table = (tmp_path / "face_backends.md").read_text(encoding="utf-8")
     assert all(table.count(f"| {backend} |") == 2 for backend in BACKENDS)
     assert (tmp_path / "face_backends.png").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_the_three_blocks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Nitsche's weights with the paper's own fields stay within a hundredth of the truth, and four tables are printed."""
+    assert main_of("muscle_blocks")(tmp_path) == pytest.approx(0.51, abs=0.05)
+    assert (tmp_path / "muscle_blocks.png").stat().st_size > 20_000
+    printed = capsys.readouterr().out
+    assert all(f"Table {n}" in printed for n in range(1, 5))

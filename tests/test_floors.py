@@ -30,8 +30,9 @@ FLOORS = {
     "studio": 7,
     "__main__": 8,
 }
-NEIGHBOURS = {("expression", "face"), ("cli", "studio")}
-"""Rooms of one floor that may be seen from another: face, then expression; the command line opens the studio."""
+NEIGHBOURS = {("expression", "face"), ("bench", "surgery"), ("cli", "studio")}
+"""Rooms of one floor that may be seen from another: face, then expression; benches measure operations; the command line
+opens the studio."""
 
 
 def _modules() -> dict[str, Path]:

@@ -12,6 +12,7 @@ BACKENDS: dict[str, str] = {
     "finite_elements": "faceanim.backends.finite_elements.solver:SolverFiniteElements",
     "mixed_fem": "faceanim.backends.mixed_fem.solver:SolverMixedFem",
     "modal_warping": "faceanim.backends.modal_warping.solver:SolverModalWarping",
+    "weighted_residual": "faceanim.backends.weighted_residual.solver:SolverWeightedResidual",
     "octree_mass_spring": "faceanim.backends.octree_mass_spring.solver:SolverOctreeMassSpring",
 }
 """Name of each backend -> "module:class", loaded on first use."""

@@ -181,10 +181,12 @@ class SolverNewton:
             self._dynamics = self._newton((inertia, drag))
         search = self._dynamics
         search.terms = (*self.terms, inertia, drag)
+        search.forget()
         trial = np.where(self.free, x + h * v, goal)
         if not np.isfinite(search.energy(trial, force)):
             trial = np.where(self.free, x, goal)
         if not (np.isfinite(search.energy(trial, force)) and search.minimise(trial, force, report)):
+            search.forget()
             lifted = search.lifted(x, np.where(self.free, 0.0, goal - x), force)
             if lifted is None or not search.minimise(lifted, force, report):
                 return None

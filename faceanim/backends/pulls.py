@@ -69,17 +69,12 @@ class Carrier(Protocol):
 class Pulls:
     """The muscles of a body on the surface that its elements carry: a `newton.Term`; `dead` are the constant forces."""
 
-    def __init__(
-        self, body: Body, elements: Carrier, skin: Embedding, *, mass: Floats, nodes: int | None = None
-    ) -> None:
-        """Compile the tables.
-
-        mass : (n,) [kg] on which gravity acts   nodes : how many there are for `skin` to name, None = those of `elements`
-        """
+    def __init__(self, body: Body, elements: Carrier, skin: Embedding, *, mass: Floats) -> None:
+        """Compile the tables; `mass` (n,) [kg] is what gravity acts on."""
         n = len(body.surface.points)
         self.elements = elements
         self.skin = skin
-        self.matrix = skin.matrix(len(elements.points) if nodes is None else nodes)
+        self.matrix = skin.matrix(len(elements.points))
         self._spread = self.matrix.T.tocsr()
         self.fibres = fibre_table(body.muscles, n)
         e = len(self.fibres.muscle)

@@ -119,6 +119,13 @@ class SyntheticTruth:
         assert len(both) == m + len(self.wedges.edges)
         return out.reshape(-1, 2)
 
+    def column_vertex(self, node: Ints) -> Ints:
+        """Return the skin vertex of the column of each node, (k,); between two columns, of the first."""
+        base = node // (2 * LAYERS + 1)
+        m = len(self.columns.vertex)
+        column = np.where(base < m, base, self.wedges.edges[np.maximum(base - m, 0), 0])
+        return np.asarray(self.columns.vertex[column])
+
     def solve(self, goal: Floats, first_step: float) -> Floats:
         """Return the skin, (n, 3) [mm], when the held nodes are at `goal` (h, 3).
 

@@ -8,7 +8,7 @@ from dataclasses import fields
 
 from faceanim.ground.errors import unknown_name
 
-TOPICS = ("faces", "muscles", "expressions", "action-units", "backends")
+TOPICS = ("faces", "muscles", "expressions", "action-units", "surgery", "backends")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,6 +98,13 @@ def _action_units() -> Listing:
     return ("number", "name", "muscles and jaw at full intensity", "sides"), rows
 
 
+def _surgery() -> Listing:
+    from faceanim.surgery.plan import load_plan, plan_names
+
+    plans = [(name, load_plan(name)) for name in plan_names()]
+    return ("plan", "operation", "source"), [(name, plan.title, plan.source) for name, plan in plans]
+
+
 def _backends() -> Listing:
     from faceanim.backends import BACKENDS, backend_class
 
@@ -115,5 +122,6 @@ _TABLES: dict[str, Callable[[], Listing]] = {
     "muscles": _muscles,
     "expressions": _expressions,
     "action-units": _action_units,
+    "surgery": _surgery,
     "backends": _backends,
 }

@@ -17,6 +17,7 @@ from faceanim.ground.errors import FaceanimError, UserError, unknown_name
 COMMANDS = {
     "express": "make pictures and a film of a face that shows an expression",
     "framerate": "measure speed and accuracy for every expression, beside the published figures",
+    "surgery": "cut and move facial bones as a plan says and predict the skin",
     "studio": "animate a face and place its muscles in the browser",
     "muscles": "read, draw and check facial muscle images",
     "info": "list faces, muscles, expressions, action units and backends",

@@ -48,6 +48,8 @@ MIXED_LAWS = {
 the pressure; "herrmann" splits the same law into mu e : e and lambda/2 (tr e)^2 (Herrmann, AIAA J. 3, 1965), which is
 stiffer on coarse meshes because the elements keep a share of the volume change.
 """
+CORRECTIONS = 3
+"""Times that a step is taken back to the volumes that its tangent promised."""
 PRESSURES = ("continuous", "by_tissue")
 
 
@@ -113,7 +115,7 @@ class MixedElements(Elements):
 
     def _blocks_of(self) -> None:
         """Find the pairs of a pressure and a node of one element, and where their entries are."""
-        e, a = self.node.shape
+        a = self.node.shape[1]
         n, m = len(self.points), len(self.pressure_node)
         key = (self.corner[:, :, None].astype(np.int64) * n + self.node[:, None, :]).ravel()
         pairs = np.unique(key)
@@ -126,6 +128,7 @@ class MixedElements(Elements):
         self._slope_indices = (3 * (pairs % n)[:, None] + np.arange(3)).ravel().astype(np.int32)
         self.indices = np.concatenate([self.indices, self._slope_indices])
         self._slopes: Floats = np.zeros((0, 4, a, 3))
+        self._last: tuple[Floats, Floats, Floats] | None = None
 
     def _compliance(self) -> sparse.csr_matrix:
         """Return M, (m, m) [mm^3/kPa]; lumped for linear elements."""
@@ -211,20 +214,40 @@ class MixedElements(Elements):
     def tangent_values(self, x: Floats, out: Floats, *, definite: bool = False) -> Floats:
         """Write the values of A, then of B, into `out` and return it.
 
+        Along a search A takes the pressure that the last tangent promised for `x`, unless the true one costs less: a step
+        that is off by the curvature of J has a pressure that is off by kappa times that, which would spoil the next one.
+        Both agree where the search ends; `forget` makes the next tangent the Hessian itself.
         definite : with d(P + p dJ/dF)/dF made positive semidefinite at every point, so that A + B^T M^-1 B is it too
         """
         if not len(self._slopes):
             e, a = self.node.shape
             self._matrix = np.zeros((e, 3 * a, 3 * a))
             self._slopes = np.zeros((e, 4, a, 3))
-        mean = self._spread(x)
         u = self._displacement(x)
+        change = self.volume_changes(x)
+        np.take(self._promised(x, change), self.corner, out=self._mean)
+        mean = self._mean
         mixed_solids.stiffnesses(
             self.cells, self._law, self._shape, u, mean, definite, self._work, self._matrix, self._slopes
         )
         solids.gather_pairs(self._gather, self._matrix, out[: self._shape_size])
         mixed_solids.gather_slopes(self._blocks, self._slopes, out[self._shape_size :].reshape(-1, 3))
+        self._last = (x.copy(), change, out[self._shape_size :].copy())
         return out
+
+    def _promised(self, x: Floats, change: Floats) -> Floats:
+        """Return the pressure (m,) for a tangent at `x`, where g is `change`."""
+        true = self._pressures_of(change)
+        if self._last is None:
+            return true
+        place, before, slope = self._last
+        promised = before + self._slope_matrix(slope) @ (x - place).ravel()
+        other = self._pressures_of(promised)
+        return other if promised @ other < change @ true else true
+
+    def forget(self) -> None:
+        """Forget the last tangent: what follows is a new search, or a check of derivatives."""
+        self._last = None
 
     def matrix(self, values: Floats) -> sparse.csr_matrix:
         """Return A, (3n, 3n) [mN/mm], the Hessian at constant pressure."""
@@ -233,8 +256,11 @@ class MixedElements(Elements):
 
     def volume_slopes(self, values: Floats) -> sparse.csr_matrix:
         """Return B = dg/dx, (m, 3n) [mm^2]."""
+        return self._slope_matrix(values[self._shape_size :])
+
+    def _slope_matrix(self, data: Floats) -> sparse.csr_matrix:
         shape = (len(self.pressure_node), self.size)
-        return sparse.csr_matrix((values[self._shape_size :], self._slope_indices, self._slope_indptr), shape=shape)
+        return sparse.csr_matrix((data, self._slope_indices, self._slope_indptr), shape=shape)
 
     def augmented(self, values: Floats) -> sparse.csr_matrix:
         """Return [[A, B^T], [B, -M]], (3n + m, 3n + m)."""
@@ -243,6 +269,7 @@ class MixedElements(Elements):
 
     def tangent(self, x: Floats, *, definite: bool = False) -> sparse.csr_matrix:
         """Return the Hessian of the energy, A + B^T M^-1 B, (3n, 3n) [mN/mm]; full, for small meshes and for checks."""
+        self.forget()
         values = self.tangent_values(x, np.empty(len(self.indices)), definite=definite)
         slope = self.volume_slopes(values)
         stiff = np.linalg.solve(self.compliance.toarray(), slope.toarray())
@@ -286,7 +313,7 @@ class MixedFactor:
         """Return the free freedoms and the pressures, 3n + a, in the order of their elimination."""
         elements = self._elements
         n = len(elements.points)
-        kept = self.free.reshape(-1, 3).any(axis=1)
+        kept: Bools = np.asarray(self.free.reshape(-1, 3).any(axis=1))
         kept[elements.pressure_node] = True
         nodes = np.flatnonzero(kept)
         inner = nodes[dissected(elements.places[nodes], elements.node_pattern[nodes][:, nodes])]
@@ -321,6 +348,17 @@ class MixedFactor:
         found = self._lu.solve(wanted)
         out[self.rows] = found + self._lu.solve(wanted - self._solved @ found)
         return out[: right.size].reshape(-1, 3)
+
+    def correction(self, x: Floats, step: Floats) -> Floats:
+        """Return the second step, (n, 3), that takes g at `x` + `step` back to g + B `step`, by the same factors."""
+        elements = self._elements
+        promised = elements.volume_changes(x) + elements.volume_slopes(self._values) @ step.ravel()
+        total, out = np.zeros_like(step), np.zeros(len(self.free) + len(promised))
+        for _ in range(CORRECTIONS):
+            full = np.concatenate([np.zeros(step.size), promised - elements.volume_changes(x + step + total)])
+            out[self.rows] = self._lu.solve(full[self.rows])
+            total += out[: step.size].reshape(-1, 3)
+        return total
 
     def definite(self) -> bool:
         """Return whether the energy has a minimum there: as many negative pivots as pressures, the others positive."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,6 +16,8 @@ ARMIJO = 1e-4
 """A step must lower the energy by this share of what its slope promises."""
 SHORTEST = 1e-9
 """A line search gives up at this share of the step."""
+STRAIGHT = 0.05
+"""Below this share of the step a constraint is straight enough: no correction is tried."""
 FLAT = 8
 """After so many steps that changed the energy by no more than rounding does, it is of no use to go on."""
 
@@ -31,6 +33,14 @@ class Factorisation(Protocol):
 
     def definite(self) -> bool:
         """Return whether the tangent factorised last is positive definite on the freedoms that are free."""
+
+
+@runtime_checkable
+class Correcting(Protocol):
+    """A factorisation that knows how a stiff constraint bends away from the tangent along a step."""
+
+    def correction(self, x: Floats, step: Floats) -> Floats:
+        """Return what added to `x` + `step` restores the constraint to what the tangent promised, (n, 3)."""
 
 
 class System(Protocol):
@@ -70,6 +80,14 @@ class System(Protocol):
 
     def factorisation(self, free: Bools) -> Factorisation:
         """Return what solves with the tangent over the freedoms that are `free`, (n, 3)."""
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """A system whose tangent depends on the tangents before it."""
+
+    def forget(self) -> None:
+        """Make the next tangent that of a new search."""
 
 
 class Term(Protocol):
@@ -156,6 +174,11 @@ class Newton:
         self.rounding = 4.0 * EPS * float(np.abs(values).max() * np.abs(x).max())
         return values
 
+    def forget(self) -> None:
+        """Begin afresh: what the elements remember of the last tangent is of no use from another place."""
+        if isinstance(self.elements, Remembering):
+            self.elements.forget()
+
     def minimise(self, x: Floats, force: Floats, report: Report) -> bool:
         """Move the free freedoms of `x` (n, 3) to the minimum, in place; return whether it was found."""
         value = self.energy(x, force)
@@ -208,9 +231,17 @@ class Newton:
         while share > SHORTEST:
             there = x + share * step
             new = self.energy(there, force)
-            if new <= value + ARMIJO * share * slope + noise:
+            most = value + ARMIJO * share * slope + noise
+            if new <= most:
                 x[:] = there
                 return new
+            if share > STRAIGHT and isinstance(self.factor, Correcting):
+                # the remedy for the Maratos effect: stiff constraints must not cut steps short (Nocedal & Wright, 15.6)
+                there += self.factor.correction(x, share * step)
+                new = min(new, bent := self.energy(there, force))
+                if bent <= most:
+                    x[:] = there
+                    return bent
             fall = new - value - share * slope
             best = -0.5 * slope * share * share / fall if np.isfinite(new) and fall > 0.0 else 0.0
             share = min(max(best, 0.1 * share), 0.5 * share)
@@ -256,6 +287,7 @@ def newton(
     load = np.zeros_like(x) if force is None else _positions("force", force, elements)
     search = solver if solver is not None else Newton(elements, free, terms, tolerance=tolerance, most=most)
     report = Report()
+    search.forget()
     x, report.converged = _walk(search, x, goal, load, first_step, least_step, report)
     _judge(search, x, report, check_definite)
     return x, report
@@ -286,6 +318,7 @@ def _walk(
             report.load_steps += 1
             step *= 2.0
         else:
+            search.forget()
             step *= 0.25
             if step < least:
                 return x, False

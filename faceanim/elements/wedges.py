@@ -64,7 +64,7 @@ class Wedges(Elements):
         self.region = zero if region is None else ints("region", region, e, below=len(self.materials))
         self._columns(levels)
         self.mesh = TetMesh(self.points, np.zeros((0, 4), dtype=np.int32))
-        self._quadrature, self.order = 18, 2
+        self._quadrature, self.order, self.extra = 18, 2, 0
         self.cells = self._cells()
         self._allocate()
         self._pattern(None)

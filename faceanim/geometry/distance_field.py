@@ -34,7 +34,7 @@ def point_distance(points: Floats, mesh: TriMesh) -> tuple[Floats, Ints]:
     return distance, triangle
 
 
-def _winding(corners: Floats, origin: Floats, spacing: float, shape: tuple[int, ...]) -> np.ndarray:
+def winding_vote(corners: Floats, origin: Floats, spacing: float, shape: tuple[int, ...]) -> np.ndarray:
     """Mean winding number on the grid, seen along the six directions of its lines, (nx, ny, nz)."""
     from faceanim.kernels import distance_field as kernels
 
@@ -82,7 +82,7 @@ def signed_distance_grid(
         corners = np.ascontiguousarray(mesh.points[mesh.triangles])
         squared = np.full(shape, band * band)
         kernels.splat_distance(corners, low, spacing, band, squared)
-        inside = _winding(corners, low + _OFFSET * spacing * 1e-3, spacing, shape) > 0.5
+        inside = winding_vote(corners, low + _OFFSET * spacing * 1e-3, spacing, shape) > 0.5
         values = np.minimum(values, np.where(inside, -1.0, 1.0) * np.sqrt(squared))
     if symmetric:
         values = 0.5 * (values + values[::-1])

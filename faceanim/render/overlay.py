@@ -38,7 +38,7 @@ def text_size(text: str, scale: float) -> tuple[int, int]:
 
 
 def _number(value: float, step: float) -> str:
-    decimals = max(0, int(np.ceil(-np.log10(step) - 1e-9))) if step > 0 else 0
+    decimals = next((d for d in range(9) if abs(round(step, d) - step) <= 1e-6 * step), 9) if step > 0 else 0
     return f"{round(value, decimals) + 0.0:.{decimals}f}"
 
 

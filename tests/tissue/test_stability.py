@@ -62,7 +62,7 @@ def test_printed_constants_in_kilopascals() -> None:
     assert tissue("muscle", poisson_ratio=0.49).shear_modulus == pytest.approx(tissue("muscle").shear_modulus)
     with pytest.raises(UserError, match="fat, muscle, skin"):
         tissue("bone")
-    with pytest.raises(UserError, match="below 0.5"):
+    with pytest.raises(UserError, match=r"below 0\.5"):
         tissue("skin", poisson_ratio=0.5)
 
 

@@ -80,6 +80,7 @@ class SolverMassSpring:
     """
 
     Options: ClassVar[type] = Options
+    skin_contact: ClassVar[bool] = True
 
     def __init__(self, body: Body, options: Any = None) -> None:
         self.body = body

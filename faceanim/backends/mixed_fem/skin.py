@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from faceanim.backends.pulls import Pulls
 from faceanim.body.body import Body
-from faceanim.body.control import Control
 from faceanim.body.solid import Solid, ThinLayer
 from faceanim.elements.shells import Sheet, Shells
 from faceanim.elements.tetrahedra import Elements
@@ -17,11 +15,11 @@ from faceanim.geometry.surface import TriMesh
 from faceanim.geometry.volume import TetMesh
 from faceanim.ground.arrays import Floats, Ints
 from faceanim.ground.errors import UserError
-from faceanim.kernels import muscles
 from faceanim.tissue.material import Material
 
-DRILLING = 0.05
-"""Share of the shear stiffness that holds a node's turn about the normal: muscles pull at arms that lean, and turn it."""
+DRILLING = 0.5
+"""Share of the shear stiffness that holds a node's turn about the normal, large: else muscles, which pull at arms that
+lean, and bends of more than a radian turn nodes on the spot."""
 THINNEST = 0.1
 """Least thickness of a shell [mm], where the layer's columns lean steeply."""
 
@@ -71,12 +69,11 @@ class Skin:
         out[self.layer.outer] = self.shells.attached(x[self.rows], self.arm)
         return out
 
-    def folded(self, x: Floats, force: Floats) -> Floats:
-        """Return forces on all nodes of the solid, (n, 3) [mN], as forces and moments on the rows of `x`."""
-        out = np.zeros_like(x)
-        out[: len(self.used)] = force[self.used]
-        np.add.at(out, self.rows, self.shells.attached_forces(x[self.rows], self.arm, force[self.layer.outer]))
-        return out
+    def inner(self, surface: Embedding) -> Embedding:
+        """Return what carries `surface` with the inner node in place of every outer one, as rows of `x`."""
+        row = self.row.copy()
+        row[self.layer.outer] = self.carrier
+        return Embedding(np.ascontiguousarray(row[surface.node]), surface.weight.copy())
 
     @staticmethod
     def turned(weight: Floats, pose: Floats) -> Floats:
@@ -139,59 +136,20 @@ class ShellTerm:
 
 
 class ShellPulls(Pulls):
-    """The muscles of a body whose skin is a shell: as `Pulls`, through what the shell carries."""
+    """The muscles of a body whose skin is a shell: they pull at the shell's inner side, as fibres do that end in the dermis.
+
+    Pulls at the outer side would tip the shell's normals over: its bending is softer than a pull on a lever of 2 mm.
+    """
 
     def __init__(self, body: Body, solid: Solid, skin: Skin, system: Elements) -> None:
-        self.shell_skin = skin
-        self.force: Floats | None = None
-        mass = node_mass(solid, skin, len(system.points))
-        super().__init__(body, system, solid.skin, mass=mass, nodes=len(solid.mesh.points))
+        inner = skin.inner(solid.skin)
+        self.shift: Floats = np.zeros_like(body.surface.points)
+        super().__init__(body, system, inner, mass=node_mass(solid, skin, len(system.points)))
+        self.shift = solid.skin.apply(solid.mesh.points) - np.asarray(self.matrix @ system.points)
 
     def surface(self, x: Floats) -> Floats:
-        """Return where the surface vertices are, (n_surface, 3) [mm]."""
-        return np.asarray(self.matrix @ self.shell_skin.full(x))
-
-    def spread(self, x: Floats, force: Floats) -> Floats:
-        """Return forces on the surface vertices as forces and moments on the rows of `x`."""
-        return self.shell_skin.folded(x, np.asarray(self._spread @ force))
-
-    def _places(self) -> None:
-        """Find which rows carry each pulled vertex, and where their blocks go in the tangent."""
-        self._pulled = np.flatnonzero(np.diff(self.fibres.start)).astype(np.int32)
-        vertex, row, weight, pair = carried_rows(self.shell_skin, self.skin, self._pulled)
-        self._weight, self._pair = weight, pair
-        first, second = joined(vertex)
-        self._first, self._second, self._vertex = first, second, vertex[first]
-        self._at = self.elements.entries(row[first], row[second])
-
-    def apply(self, control: Control) -> None:
-        """Take the activations, poses and loads of `control`; they hold until the next call."""
-        muscles.aim(self.fibres, control.activation, control.bone_pose, self.aimed)
-        self.dead[:] = self.mass[:, None] * control.gravity
-        self.force = control.force
-
-    def energy(self, x: Floats) -> float:
-        """Return the energy of muscles and surface forces [uJ]."""
-        if self.force is None:
-            return super().energy(x)
-        return super().energy(x) - float((self.force * (self.surface(x) - self.surface(self.elements.points))).sum())
-
-    def forces(self, x: Floats) -> Floats:
-        """Return their forces and moments on the rows, (k + m, 3)."""
-        out = super().forces(x)
-        return out if self.force is None else out + self.spread(x, self.force)
-
-    def add_tangent(self, x: Floats, values: Floats) -> None:
-        """Add the Hessian but for what turning adds to the lever arms: G_a^T H G_b for all rows a, b of each vertex."""
-        if not self.acts:
-            return
-        block = self._blocks(x).reshape(-1, 3, 3)
-        slope = self.shell_skin.shells.attached_slopes(x[self.shell_skin.rows], self.shell_skin.arm)
-        every = np.concatenate([slope, np.eye(3)[None]])[self._pair] * self._weight[:, None, None]
-        part = np.einsum(
-            "kji,kjl,klm->kim", every[self._first], block[self._vertex], every[self._second], optimize=True
-        )
-        values += np.bincount(self._at.ravel(), part.ravel(), len(values))
+        """Return where the surface vertices are for the muscles, (n_surface, 3) [mm]: they go along but do not turn."""
+        return super().surface(x) + self.shift
 
 
 def node_mass(solid: Solid, skin: Skin, rows: int) -> Floats:
@@ -200,34 +158,3 @@ def node_mass(solid: Solid, skin: Skin, rows: int) -> Floats:
     out[: len(skin.used)] = solid.node_mass[skin.used]
     np.add.at(out, skin.carrier, solid.node_mass[skin.layer.outer])
     return out
-
-
-def carried_rows(skin: Skin, surface: Embedding, vertex: Ints) -> tuple[Ints, Ints, Floats, Ints]:
-    """Return what carries the surface vertices `vertex`: place in that list, row, weight, and pair of the layer or -1.
-
-    A vertex on an outer node is carried by the inner node's row and by the row of the pair's rotation.
-    """
-    node, weight = surface.node[vertex], surface.weight[vertex]
-    at, k = np.nonzero(weight)
-    node, weight = node[at, k], weight[at, k]
-    outer = np.full(len(skin.row), -1, dtype=np.int32)
-    outer[skin.layer.outer] = np.arange(len(skin.layer.outer))
-    pair = outer[node]
-    on_skin = pair >= 0
-    row = np.where(on_skin, skin.carrier[pair], skin.row[node])
-    turn = len(skin.used) + pair[on_skin]
-    none = np.full(len(node), -1, dtype=np.int32)
-    return (
-        np.concatenate([at, at[on_skin]]).astype(np.int32),
-        np.concatenate([row, turn]).astype(np.int32),
-        np.concatenate([weight, weight[on_skin]]),
-        np.concatenate([none, pair[on_skin]]),
-    )
-
-
-def joined(group: Ints) -> tuple[Ints, Ints]:
-    """Return all ordered pairs of items that have the same `group` (k,), 2 x (p,)."""
-    k = len(group)
-    member = sparse.coo_matrix((np.ones(k), (np.arange(k), group))).tocsr()
-    both = (member @ member.T).tocoo()
-    return both.row.astype(np.int32), both.col.astype(np.int32)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from faceanim.backends.mixed_fem.options import Options
-from faceanim.backends.mixed_fem.skin import ShellPulls, ShellTerm, Skin, carried_rows, joined, node_mass
+from faceanim.backends.mixed_fem.skin import ShellPulls, ShellTerm, Skin, node_mass
 from faceanim.backends.mixed_fem.tissues import beyond_limit, largest_stretch, limits_said, materials_of
 from faceanim.backends.newton_solver import SolverNewton
 from faceanim.backends.nodal import carry, solid_of
@@ -19,6 +19,9 @@ from faceanim.elements.mixed import MixedElements
 from faceanim.elements.newton import Report, Term
 from faceanim.elements.tetrahedra import Elements
 from faceanim.ground.arrays import Floats
+
+FIRST_PULL = 0.25
+"""Activation that is tried at once from rest."""
 
 
 class SolverMixedFem(SolverNewton):
@@ -48,6 +51,7 @@ class SolverMixedFem(SolverNewton):
             self._build_mixed()
         else:
             self._build_solid()
+        self.matrix = self.solid.skin.matrix(len(self.solid.mesh.points))
         self._hold()
         self._matrices()
 
@@ -66,10 +70,7 @@ class SolverMixedFem(SolverNewton):
         assert solid.layer is not None
         material = self.materials[solid.layer.region]
         self.skin = skin = Skin(solid, solid.layer, material, self.model.law or self.options.law)
-        vertex, row, _, _ = carried_rows(skin, solid.skin, np.unique(body.muscles.node))
-        first, second = joined(vertex)
-        pulled = np.unique(np.stack([row[first], row[second]], axis=1), axis=0)
-        together = np.concatenate([skin.coupled, pulled]).astype(np.int32)
+        together = np.concatenate([skin.coupled, coupled(body, skin.inner(solid.skin))]).astype(np.int32)
         self.elements = self._elements(skin.flesh, skin.region, coupled=together, extra=len(skin.arm))
         self.node_mass = node_mass(solid, skin, len(self.elements.points))
         self.shell = ShellTerm(skin, self.elements)
@@ -118,7 +119,7 @@ class SolverMixedFem(SolverNewton):
 
     def surface(self, state: State, out: np.ndarray) -> None:
         """Write the surface points (n, 3) [mm] into `out`."""
-        out[:] = self.pulls.surface(state.q)
+        out[:] = self.matrix @ self.nodes(state)
 
     def nodes(self, state: State) -> Floats:
         """Return where all nodes of the body's solid are, (n, 3) [mm]."""
@@ -141,11 +142,14 @@ class SolverMixedFem(SolverNewton):
         return out
 
     def _first_step(self, control: Control, guess: State | None) -> float:
-        """Return the share of the bones' way that is at most `options.step` long."""
+        """Return the share of the load in which bones go at most `options.step`, and muscles pull a little."""
         start = self._start(control, guess)
         way = self._placed(control.bone_pose, start)[: self._nodes] - start[: self._nodes]
         longest = float(np.linalg.norm(way, axis=1).max(initial=0.0))
-        return 1.0 if self.model.law == "linear" else min(1.0, self.options.step / max(longest, 1e-9))
+        if self.model.law == "linear":
+            return 1.0
+        pulled = float(control.activation.max(initial=0.0)) if guess is None else 0.0
+        return min(1.0, self.options.step / max(longest, 1e-9), FIRST_PULL / max(pulled, FIRST_PULL))
 
     def _note_doubts(self, report: Report) -> None:
         super()._note_doubts(report)
