@@ -132,7 +132,7 @@ def faithfulness(face: Face) -> str:
 def gallery(face: Face) -> None:
     """Run the scripts of docs/examples and write their pictures and the table of backends into docs/."""
     with TemporaryDirectory() as scratch:
-        for name in ("bar_bending", "octree_block", "face_backends"):
+        for name in ("bar_bending", "octree_block", "muscle_blocks", "face_backends"):
             print(f"{name}: {main_of(name)(scratch):.3g}")
         for what in ("bar", "face"):
             print(f"twist_and_drag {what}: {main_of('twist_and_drag')(scratch, what):.3g}")
@@ -140,6 +140,19 @@ def gallery(face: Face) -> None:
         for made in (*Path(scratch).glob("*.png"), *Path(scratch).glob("*.md")):
             (DOCS / made.name).write_bytes(made.read_bytes())
     draw_cut(face, DOCS / "tissue_cut.png", place=6.0)
+
+
+def operations() -> None:
+    """Draw two of the built-in operations: bones, skin before and after, and how far it has moved."""
+    with TemporaryDirectory() as folder:
+        for plan in ("mandible_advance", "midface_advance"):
+            out = Path(folder) / plan
+            faceanim(["surgery", plan, "--out", str(out), "--size", "360"])
+            rows = [cv2.imread(str(out / f"{name}.png"))[:, :, ::-1] for name in ("before", "after", "map")]
+            width = max(row.shape[1] for row in rows)
+            padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=247) for row in rows]
+            write_png(DOCS / f"surgery_{plan}.png", np.ascontiguousarray(np.concatenate(padded)))
+            (DOCS / f"bones_{plan}.png").write_bytes((out / "bones.png").read_bytes())
 
 
 def main_of(example: str) -> Any:
@@ -151,7 +164,7 @@ def insert_tables() -> None:
     """Put the tables of docs/ between their marks in README.md."""
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    for name in ("framerate", "faithfulness", "muscles", "face_backends"):
+    for name in ("framerate", "faithfulness", "muscles", "face_backends", "four_models"):
         if not (DOCS / f"{name}.md").exists():
             continue
         table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
@@ -161,10 +174,13 @@ def insert_tables() -> None:
     readme.write_text(text, encoding="utf-8")
 
 
+PARTS = ("pictures", "muscles", "gallery", "surgery", "framerate", "faithfulness", "insert")
+
+
 def main() -> None:
     """Make everything, or what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=("pictures", "muscles", "gallery", "framerate", "faithfulness", "insert"))
+    parser.add_argument("--only", choices=PARTS)
     only = parser.parse_args().only
     DOCS.mkdir(exist_ok=True)
     apex = Apex("default")
@@ -174,6 +190,8 @@ def main() -> None:
         (DOCS / "muscles.md").write_text(muscle_images(apex.face), encoding="utf-8")
     if only in (None, "gallery"):
         gallery(apex.face)
+    if only in (None, "surgery"):
+        operations()
     if only in (None, "faithfulness"):
         (DOCS / "faithfulness.md").write_text(faithfulness(apex.face), encoding="utf-8")
     if only in (None, "framerate"):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from faceanim.backends.mixed_fem.options import MODELS, Options
+from faceanim.backends.mixed_fem.options import Options
 from faceanim.bench.synthetic_truth import (
     EDGE,
     LAYERS,
@@ -187,4 +187,3 @@ ABLATIONS: tuple[dict[str, Any], ...] = tuple(
     for pressure in (False, True)
 )
 """What the step from the nonlinear to the mixed model changes, one thing at a time."""
-assert set(PAPER) == set(MODELS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
@@ -118,3 +120,46 @@ class Factor:
     def definite(self) -> bool:
         """Return whether the matrix factorised last is positive definite: all its pivots are positive."""
         return bool((self._lu.U.diagonal() > 0).all())
+
+
+class Cholesky(Factor):
+    """The same by CHOLMOD through the extra `cholespy`, three times as fast on large quadratic meshes; definite only.
+
+    A matrix that is not definite counts as one that cannot be factorised, so that a search takes the definite tangent.
+    """
+
+    def factor(self, values: Floats, shift: float = 0.0) -> bool:
+        """Factorise the matrix with these `values` plus `shift` I; return whether it is positive definite."""
+        from cholespy import CholeskySolverD, MatrixType
+
+        self._values = values
+        self._matrix.data[:] = values[self._pick]
+        matrix = self._matrix + shift * sparse.identity(len(self.rows), format="csc") if shift else self._matrix
+        parts = (matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data)
+        try:
+            self._lu = _Solved(CholeskySolverD(len(self.rows), *parts, MatrixType.CSC))
+        except ValueError:
+            self._lu = None
+        return self._lu is not None
+
+    def definite(self) -> bool:
+        """Return true: others are not factorised."""
+        return self._lu is not None
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A Cholesky factor with the interface of SuperLU's."""
+
+    factor: Any
+
+    def solve(self, right: Floats) -> Floats:
+        """Return the solution (n,)."""
+        out = np.zeros(len(right))
+        self.factor.solve(np.ascontiguousarray(right), out)
+        return out
+
+
+def has_cholesky() -> bool:
+    """Whether the extra is installed."""
+    return find_spec("cholespy") is not None

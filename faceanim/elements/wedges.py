@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from faceanim.elements import shapes
+from faceanim.elements.factor import Cholesky, Factor, has_cholesky
 from faceanim.elements.tetrahedra import LAWS, Elements
 from faceanim.geometry.volume import TetMesh
-from faceanim.ground.arrays import Floats, Ints, ints
+from faceanim.ground.arrays import Bools, Floats, Ints, ints
 from faceanim.ground.errors import UserError, unknown_name
 from faceanim.tissue.material import Material
 
@@ -83,6 +84,10 @@ class Wedges(Elements):
         first = six[:, None, None, :] * height + 2 * np.arange(self.layers)[None, :, None, None]
         node = first + np.arange(3)[None, None, :, None]
         self.node = np.ascontiguousarray(node.reshape(-1, 18), dtype=np.int32)
+
+    def factorisation(self, free: Bools) -> Factor:
+        """Return what solves with the tangent over the freedoms that are `free`: by Cholesky's method if it is there."""
+        return Cholesky(self, free) if has_cholesky() else Factor(self, free)
 
     def rule(self, points: int) -> tuple[Floats, Floats, Floats]:
         """Return shape values (q, 18), gradients (e, q, 18, 3) [1/mm] and weights (e, q) [mm^3] of the one rule, q = 18."""

@@ -38,7 +38,7 @@ def test_everything_is_there(made: Path) -> None:
     record = json.loads((made / "run.json").read_text(encoding="utf-8"))
     assert set(record["files"]) == MADE
     assert record["converged"] is True and record["fraction"] == 1.0 and record["failure"] is None
-    assert record["backend"]["options"]["law"] == "linear"
+    assert record["backend"]["options"]["model"] == "linear"
     assert record["bones"]["chin"]["volume_mm3"] > 1000.0
     assert record["plan"]["piece"][0]["name"] == "chin"
     assert record["bone_travel_mm"] == pytest.approx(6.0)

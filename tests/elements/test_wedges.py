@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from faceanim.elements.factor import Cholesky, Factor
 from faceanim.elements.newton import newton
 from faceanim.elements.tetrahedra import Elements
 from faceanim.elements.wedges import Wedges, wedge_shapes
@@ -98,3 +99,17 @@ def test_columns_that_cross_are_refused() -> None:
     levels, triangles = sheet(2, 2, 2)
     with pytest.raises(UserError, match="inverted or flat"):
         Wedges(levels[:, ::-1], triangles, SOFT)
+
+
+def test_cholesky_solves_as_the_general_factor_does() -> None:
+    """Both give the same answer; a matrix that is not definite is not factorised."""
+    pytest.importorskip("cholespy")
+    levels, triangles = sheet(2, 2, 2)
+    wedges = Wedges(levels, triangles, SOFT)
+    free = np.repeat((wedges.points[:, 0] > 1e-9)[:, None], 3, axis=1)
+    values = wedges.tangent_values(wedges.points, np.empty(len(wedges.indices)))
+    right = np.random.default_rng(0).normal(size=wedges.points.shape)
+    one, other = Factor(wedges, free), Cholesky(wedges, free)
+    assert one.factor(values) and other.factor(values) and other.definite()
+    np.testing.assert_allclose(other.solve(right), one.solve(right), rtol=1e-9, atol=1e-9)
+    assert not other.factor(-values) and not other.definite()
