@@ -223,7 +223,8 @@ def test_collocation_takes_no_point_loads() -> None:
 @pytest.mark.parametrize(
     "change",
     [{"basis": "fourier"}, {"method": "galerkin"}, {"solver": "cg"}, {"degree": 0}, {"terms": 1.5}, {"terms": True},
-     {"gamma": 0.0}, {"gamma": np.nan}, {"reach": -1.0}, {"limit": np.inf}, {"cut_off": 0.1}, {"patch_degree": 0}],
+     {"gamma": 0.0}, {"gamma": np.nan}, {"reach": -1.0}, {"limit": np.inf}, {"cut_off": 0.1}, {"patch_degree": 0},
+     {"corrections": -1}, {"corrections": 1.5}, {"corrections": True}],
     ids=str,
 )  # fmt: skip
 def test_wrong_options_are_refused(change: dict[str, Any]) -> None:

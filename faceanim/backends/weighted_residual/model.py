@@ -27,7 +27,7 @@ from faceanim.ground.cache import content_key, load_arrays, save_arrays
 from faceanim.ground.errors import UserError
 from faceanim.kernels import muscles
 
-VERSION = "weighted residual answers 3"
+VERSION = "weighted residual answers 5"
 NEGLIGIBLE = 0.003
 """Share of an answer's largest displacement that nobody sees."""
 STEPS = 64

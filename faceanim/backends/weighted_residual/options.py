@@ -28,6 +28,8 @@ class Options:
     cut_off : eigenvalues below this share of the largest are left out
     reach : [mm] flesh within this way of a pulled vertex answers it; a body no larger than two reaches is one patch
     patch_degree : degree of the polynomials in a patch of a larger body, where `basis` is "navier"
+    corrections : how often what superposed patches leave unbalanced is answered by columns from skin to bone; 0 = the
+        patches alone, which on a face give little more than half of the movement
     limit : [-] strain of the surface towards which the answer of a muscle saturates; linear theory means little beyond
     cache : keep the answers on disk
     """
@@ -42,6 +44,7 @@ class Options:
     cut_off: float = 1e-12
     reach: float = 32.0
     patch_degree: int = 5
+    corrections: int = 3
     limit: float = 0.8
     cache: bool = True
 
@@ -57,6 +60,8 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
                 raise UserError(f"{name} = {value} must be a whole number of at least 1")
+        if isinstance(self.corrections, bool) or not isinstance(self.corrections, Integral) or self.corrections < 0:
+            raise UserError(f"corrections = {self.corrections} must be a whole number of at least 0")
         for name in ("gamma", "displacement_weight", "reach", "limit"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
