@@ -68,6 +68,10 @@ class SolverNewton:
         """Return the share of a static load that is tried at once."""
         return 1.0
 
+    def _largest_step(self, control: Control, start: Floats) -> float:
+        """Return the largest share of a static load that may be tried at once."""
+        return 1.0
+
     def rest(self) -> State:
         """Return a new state: the body at rest."""
         return State(self.elements.points.copy(), np.zeros_like(self.elements.points))
@@ -86,11 +90,12 @@ class SolverNewton:
         if self._statics is None:
             self._statics = self._newton(())
         start = self._start(control, guess)
+        largest_step = self._largest_step(control, start)
         first_step = self._first_step(control, guess)
         x, report = newton(
             self.elements, fixed=~self.free, values=self._placed(control.bone_pose, start), force=self.pulls.dead,
-            start=start, first_step=first_step, least_step=self.options.least_step, check_definite=True,
-            solver=self._statics,
+            start=start, first_step=first_step, least_step=self.options.least_step, largest_step=largest_step,
+            check_definite=True, solver=self._statics,
         )  # fmt: skip
         self.static_report = report
         self.last_static = State(x, np.zeros_like(x), 0.0 if guess is None else guess.t)

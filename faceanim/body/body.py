@@ -83,10 +83,14 @@ class Muscles:
 
 @dataclass(frozen=True, eq=False)
 class Bone:
-    """A rigid bone: `grid` is its signed distance in its own rest frame (None = nothing to collide with)."""
+    """A rigid bone: `grid` is its signed distance in its own rest frame (None = nothing to collide with).
+
+    surface : the bone with its teeth, closed, in the same frame, for flesh that slides on it (None = nothing to slide on)
+    """
 
     name: str
     grid: DistanceGrid | None = None
+    surface: TriMesh | None = None
 
 
 @dataclass(frozen=True, eq=False)

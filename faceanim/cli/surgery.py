@@ -234,8 +234,15 @@ def _record(found: Prediction, rows: Any, farthest: float) -> dict[str, Any]:
         "bone_travel_mm": operation.travel,
         "skin_travel_mm": farthest,
         "movement_mm": rows,
+        "contact": _contact(found),
         "seconds": dict(found.seconds),
     }  # fmt: skip
+
+
+def _contact(found: Prediction) -> dict[str, Any] | None:
+    """Return how flesh and bones touch at the end, None for a backend or an option without such contact."""
+    report = getattr(found.solver, "contact_report", lambda state: None)(found.state)
+    return None if report is None else dict(report._asdict())
 
 
 def _closing_line(found: Prediction, record: dict[str, Any], folder: Path) -> str:

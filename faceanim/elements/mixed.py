@@ -316,11 +316,16 @@ class MixedFactor:
         kept: Bools = np.asarray(self.free.reshape(-1, 3).any(axis=1))
         kept[elements.pressure_node] = True
         nodes = np.flatnonzero(kept)
-        inner = nodes[dissected(elements.places[nodes], elements.node_pattern[nodes][:, nodes])]
-        rank = np.zeros(n, dtype=np.int64)
-        rank[inner] = np.arange(len(inner))
         moving = np.flatnonzero(self.free)
         rows = np.concatenate([moving, 3 * n + np.arange(len(elements.pressure_node))])
+        owner = np.concatenate([moving // 3, elements.pressure_node])
+        belongs = sparse.csr_matrix((np.ones(len(rows)), (np.arange(len(rows)), owner)), shape=(len(rows), n))
+        # held nodes count by their pressures alone: pairs of them that only muscles or bones couple would mislead
+        matrix = abs(elements.augmented(np.ones(len(elements.indices))))[rows][:, rows]
+        adjacent = (belongs.T @ matrix @ belongs).tocsr()
+        inner = nodes[dissected(elements.places[nodes], adjacent[nodes][:, nodes])]
+        rank = np.zeros(n, dtype=np.int64)
+        rank[inner] = np.arange(len(inner))
         at = np.concatenate([2 * rank[moving // 3], 2 * rank[elements.pressure_node] + 1])
         return np.asarray(rows[np.argsort(at, kind="stable")])
 

@@ -269,6 +269,7 @@ def newton(
     most: int = 60,
     first_step: float = 1.0,
     least_step: float = 1.0 / 512.0,
+    largest_step: float = 1.0,
     check_definite: bool = False,
     solver: Newton | None = None,
 ) -> tuple[Floats, Report]:
@@ -276,9 +277,10 @@ def newton(
 
     fixed : (n, 3) or (n,) bool, freedoms that are prescribed   values : (n, 3) [mm], their positions (None = at rest)
     force : (n, 3) [mN], constant   start : (n, 3), where to begin (None = at rest)
-    The whole load is tried at once, or `first_step` of it; what fails is divided, down to `least_step`. Part t of the
-    way is the balance with the unbalanced forces of `start` reduced to 1 - t and the fixed freedoms t of their way.
-    When even the least step fails, the state reached and its fraction are returned with `report.converged` false.
+    The whole load is tried at once, or `first_step` of it; what fails is divided, down to `least_step`; no step is
+    larger than `largest_step`. Part t of the way is the balance with the unbalanced forces of `start` reduced to 1 - t
+    and the fixed freedoms t of their way. When even the least step fails, the state reached and its fraction are
+    returned with `report.converged` false.
     Raises `UserError` for arrays of wrong shape or with numbers that are not finite.
     """
     free = ~_freedoms(elements, fixed)
@@ -288,16 +290,18 @@ def newton(
     search = solver if solver is not None else Newton(elements, free, terms, tolerance=tolerance, most=most)
     report = Report()
     search.forget()
-    x, report.converged = _walk(search, x, goal, load, first_step, least_step, report)
+    x, report.converged = _walk(search, x, goal, load, (first_step, least_step, largest_step), report)
     _judge(search, x, report, check_definite)
     return x, report
 
 
 def _walk(
-    search: Newton, x: Floats, goal: Floats, load: Floats, step: float, least: float, report: Report
+    search: Newton, x: Floats, goal: Floats, load: Floats, steps: tuple[float, float, float], report: Report
 ) -> tuple[Floats, bool]:
     """Follow the load from `x` to its end in steps as long as they converge; return where it got, and whether to the end."""
     free = search.free
+    step, least, largest = steps
+    step = min(step, largest)
     begin = np.where(free, 0.0, x)
     way = np.where(free, 0.0, goal) - begin
     total, _ = search.forces(x)
@@ -316,7 +320,7 @@ def _walk(
         if there is not None and search.minimise(there, force, report):
             x, report.fraction = there, part
             report.load_steps += 1
-            step *= 2.0
+            step = min(2.0 * step, largest)
         else:
             search.forget()
             step *= 0.25

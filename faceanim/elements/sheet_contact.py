@@ -162,9 +162,13 @@ class SheetPenalty:
         row = np.repeat(np.arange(pattern.shape[0], dtype=np.int64), np.diff(pattern.indptr))
         self._known = np.sort(row * pattern.shape[0] + pattern.indices)
 
+    def place(self, x: Floats) -> Floats:
+        """Return where the surface is when the nodes are at `x` (n, 3), (n_surface, 3) [mm]."""
+        return np.asarray(self._matrix @ x)
+
     def found(self, x: Floats, reach: float = 0.0) -> Found:
         """Return the contacts at node positions `x` (n, 3) of vertices less than `reach` [mm] before the gap."""
-        place = np.ascontiguousarray(self._matrix @ x)
+        place = np.ascontiguousarray(self.place(x))
         kernels.sheet_depths(
             place, self.table, self._ball, self._looks, self._depth, self._corner, self._share, self._normal
         )
@@ -185,7 +189,7 @@ class SheetPenalty:
     def _depths(self, x: Floats) -> tuple[Found, Floats]:
         """Return the contacts that count at `x` and how deep they are, (c,) [mm], zero where they do not touch."""
         found = self.found(x) if self._frozen is None else self._frozen
-        depth = found.offset - _heights(self._matrix @ x, found.vertex, found.share, found.normal)
+        depth = found.offset - _heights(self.place(x), found.vertex, found.share, found.normal)
         return found, np.maximum(depth, 0.0)
 
     def energy(self, x: Floats) -> float:
@@ -228,7 +232,7 @@ class SheetPenalty:
     def report(self, x: Floats) -> SheetTouch:
         """Return how the sheets touch at `x`, by what is nearest there."""
         found = self.found(x)
-        depth = found.offset - _heights(self._matrix @ x, found.vertex, found.share, found.normal)
+        depth = found.offset - _heights(self.place(x), found.vertex, found.share, found.normal)
         through = float((depth - self.table.pair_gap[found.row]).max(initial=0.0))
         pressed = float((self.weight[found.row] * depth).sum())
         return SheetTouch(float(depth.max(initial=0.0)), max(through, 0.0), int((depth > RIM).sum()), pressed)

@@ -17,6 +17,7 @@ from faceanim.face.library import asset_arrays, asset_folder, asset_text
 from faceanim.face.muscles import BONES, AnyMuscle, Lids, Terrain, build_muscles, parse_muscles
 from faceanim.face.skull import JawMotion, Skull
 from faceanim.face.tissue import Tissue, parse_tissue
+from faceanim.geometry.closing import together
 from faceanim.geometry.surface import TriMesh
 from faceanim.ground.arrays import Bools, Floats, Ints, floats, ints
 from faceanim.ground.errors import AssetError
@@ -33,6 +34,11 @@ class Part:
     triangles: Ints
     colour: np.ndarray
     bone: int
+
+    @property
+    def touches(self) -> bool:
+        """Whether flesh meets it as it meets bone: teeth and gums."""
+        return self.name.startswith(("teeth", "gums")) and len(self.triangles) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +220,15 @@ class Face:
         limit = np.full(len(lids), h.shear_limit)
         return Attachment(self.bone_weight, stiffness, h.alpha, h.s0, shear, limit)
 
+    @cached_property
+    def bone_surfaces(self) -> tuple[TriMesh, TriMesh]:
+        """Cranium and jaw with their teeth and gums, closed."""
+        cranium, jaw = (
+            together([bone, *(TriMesh(p.points, p.triangles) for p in self.parts if p.bone == k and p.touches)])
+            for k, bone in enumerate((self.cranium, self.jaw_mesh))
+        )
+        return cranium, jaw
+
     def body(self) -> Body:
         """Return this head as a body that any backend can move; its volume is grown when it is first asked for."""
         t, mesh = self.tissue, self.mesh
@@ -231,7 +246,7 @@ class Face:
             pinned=self.pinned,
             attachment=self.attachment,
             muscles=self.muscles,
-            bones=(Bone("cranium", self.skull.cranium_grid), Bone("jaw", self.skull.jaw_grid)),
+            bones=tuple(map(Bone, BONES, (self.skull.cranium_grid, self.skull.jaw_grid), self.bone_surfaces)),
             bone_contact=self._bone_contact(),
             spheres=tuple(
                 attach.eyeball_contact(mesh.points, f"eye_{s}", e.centre, e.radius, contact, t.solid.lid_thickness)

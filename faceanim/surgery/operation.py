@@ -109,10 +109,7 @@ class Operation:
 
     def teeth(self, bone: int) -> list[TriMesh]:
         """Return the teeth and gums that a bone carries."""
-        carried = [
-            p for p in self.parts if p.bone == bone and p.name.startswith(("teeth", "gums")) and len(p.triangles)
-        ]
-        return [TriMesh(p.points, p.triangles) for p in carried]
+        return [TriMesh(p.points, p.triangles) for p in self.parts if p.bone == bone and p.touches]
 
     def walls(self, bone: int) -> Bools:
         """Return which triangles of a bone lie in a cut, (t,)."""

@@ -17,6 +17,7 @@ from faceanim.body.solid import Solid
 from faceanim.face import attach
 from faceanim.face.tissue_carry import four_weights
 from faceanim.face.tissue_volume import flesh
+from faceanim.geometry.closing import together
 from faceanim.geometry.distance import DistanceGrid
 from faceanim.geometry.distance_field import signed_distance_grid
 from faceanim.geometry.embedding import Embedding
@@ -59,7 +60,10 @@ def surgical_body(operation: Operation, *, contact: bool = True) -> Body:
     grids = _contact_grids(operation) if contact else None
     return replace(
         body,
-        bones=tuple(Bone(name, grids[k] if grids else None) for k, name in enumerate(operation.names)),
+        bones=tuple(
+            Bone(name, grids[k] if grids else None, together([operation.bones[k], *operation.teeth(k)]))
+            for k, name in enumerate(operation.names)
+        ),
         attachment=replace(body.attachment, bone_weight=skin),
         muscles=replace(muscles, bone=carrier.astype(np.int32)),
         bone_contact=_bone_contact(face, grids) if grids else None,

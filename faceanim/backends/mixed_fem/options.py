@@ -33,6 +33,7 @@ MODELS = {
 STABLE = ("tension", "neo_hookean")
 LAWS = (*STABLE, "mooney_rivlin")
 TISSUES = ("body", "craniofacial")
+CONTACTS = ("film", "slide", "stick")
 INTEGRATORS = ("backward_euler", "trapezoid")
 
 
@@ -44,6 +45,9 @@ class Options:
     law : of the nonlinear models: "tension" (stable, the tension curve of the tissue), "mooney_rivlin" (as published;
     loses its stability at moderate stretches where c01 < 0) or "neo_hookean"
     tissue : "body" = the body's own constants; "craniofacial" = the published ones for its skin, fat and muscle
+    contact : "film" (a soft film between flesh and teeth stands for it), "slide" (the film is taken out: flesh slides
+    without friction on bone and teeth, lips and lids touch) or "stick" (nodes that a bone meets are moved out of it and
+    stick for that step; equilibria only)
     integrator : "backward_euler" (damps) or "trapezoid"
     tolerance : largest unbalanced force over the largest element force at which a solution is taken as converged [-]
     most : Newton steps before a load counts as too much at once
@@ -56,6 +60,7 @@ class Options:
     shell: bool | None = None
     homogeneous: bool | None = None
     pressure: bool | None = None
+    contact: str = "film"
     integrator: str = "backward_euler"
     tolerance: float = 1e-6
     most: int = 30
@@ -63,7 +68,8 @@ class Options:
     least_step: float = 1.0 / 256.0
 
     def __post_init__(self) -> None:
-        for field, known in (("model", MODELS), ("law", LAWS), ("tissue", TISSUES), ("integrator", INTEGRATORS)):
+        for field, known in (("model", MODELS), ("law", LAWS), ("tissue", TISSUES),
+                             ("contact", CONTACTS), ("integrator", INTEGRATORS)):  # fmt: skip
             if getattr(self, field) not in known:
                 raise unknown_name(f"mixed_fem: {field}", getattr(self, field), known)
         for field, sound, rule in (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from faceanim.backends.mixed_fem.flesh import Flesh
 from faceanim.backends.pulls import Pulls
 from faceanim.body.body import Body
 from faceanim.body.solid import Solid, ThinLayer
@@ -12,7 +13,6 @@ from faceanim.elements.shells import Sheet, Shells
 from faceanim.elements.tetrahedra import Elements
 from faceanim.geometry.embedding import Embedding
 from faceanim.geometry.surface import TriMesh
-from faceanim.geometry.volume import TetMesh
 from faceanim.ground.arrays import Floats, Ints
 from faceanim.ground.errors import UserError
 from faceanim.tissue.material import Material
@@ -27,26 +27,20 @@ THINNEST = 0.1
 class Skin:
     """A solid divided into the flesh beneath its layer and the layer as a shell.
 
-    Positions `x` (k + m, 3): the k nodes of `flesh`, then the rotation vectors of the layer's m pairs. The outer nodes of
+    Positions `x` (k + m, 3): the k rows of `rest`, then the rotation vectors of the layer's m pairs. The outer nodes of
     the layer are carried: x_outer = x_inner + R arm, and the shell's middle lies half-way.
 
-    used : (k,) nodes of the solid that the flesh has   carrier : (m,) rows of the inner nodes   arm : (m, 3) [mm]
+    carrier : (m,) rows of the inner nodes   arm : (m, 3) [mm]
     """
 
-    def __init__(self, solid: Solid, layer: ThinLayer, material: Material, law: str) -> None:
-        mesh = solid.mesh
-        inside = solid.region != layer.region
-        self.used = np.unique(mesh.tets[inside]).astype(np.int32)
-        row = np.full(len(mesh.points), -1, dtype=np.int32)
-        row[self.used] = np.arange(len(self.used))
+    def __init__(self, rest: Flesh, solid: Solid, layer: ThinLayer, material: Material, law: str) -> None:
+        mesh, row = solid.mesh, rest.row
         if (row[layer.inner] < 0).any() or (row[layer.outer] >= 0).any():
             raise UserError("the skin's layer must lie on other flesh, pair by pair; this one cannot become a shell")
-        self.flesh = TetMesh(mesh.points[self.used], row[mesh.tets[inside]])
-        self.region = solid.region[inside]
-        self.layer, self.row = layer, row
+        self.rest, self.flesh, self.layer = rest, rest.mesh, layer
         self.carrier = row[layer.inner]
         self.arm = mesh.points[layer.outer] - mesh.points[layer.inner]
-        self.rows = np.concatenate([self.carrier, len(self.used) + np.arange(len(self.arm))]).astype(np.int32)
+        self.rows = np.concatenate([self.carrier, len(rest.points) + np.arange(len(self.arm))]).astype(np.int32)
         thickness, offset = self._middle()
         sheets = [sheet_of(material, law, float(h)) for h in thickness]
         every = np.arange(len(sheets), dtype=np.int32)
@@ -58,20 +52,19 @@ class Skin:
 
         The way is along the normal: a leaning arm would let the membrane turn the nodes about it, which hardly resist.
         """
-        surface = TriMesh(self.flesh.points[self.carrier] + 0.5 * self.arm, self.layer.triangles)
+        surface = TriMesh(self.rest.points[self.carrier] + 0.5 * self.arm, self.layer.triangles)
         height = np.maximum(np.einsum("mi,mi->m", self.arm, surface.vertex_normals), THINNEST)
         return height[self.layer.triangles].mean(axis=1), 0.5 * height[:, None] * surface.vertex_normals
 
     def full(self, x: Floats) -> Floats:
         """Return where all nodes of the solid are, (n, 3) [mm]."""
-        out = np.empty((len(self.row), 3))
-        out[self.used] = x[: len(self.used)]
+        out = self.rest.full(x)
         out[self.layer.outer] = self.shells.attached(x[self.rows], self.arm)
         return out
 
     def inner(self, surface: Embedding) -> Embedding:
         """Return what carries `surface` with the inner node in place of every outer one, as rows of `x`."""
-        row = self.row.copy()
+        row = self.rest.row.copy()
         row[self.layer.outer] = self.carrier
         return Embedding(np.ascontiguousarray(row[surface.node]), surface.weight.copy())
 
@@ -144,7 +137,7 @@ class ShellPulls(Pulls):
     def __init__(self, body: Body, solid: Solid, skin: Skin, system: Elements) -> None:
         inner = skin.inner(solid.skin)
         self.shift: Floats = np.zeros_like(body.surface.points)
-        super().__init__(body, system, inner, mass=node_mass(solid, skin, len(system.points)))
+        super().__init__(body, system, inner, mass=node_mass(solid, skin))
         self.shift = solid.skin.apply(solid.mesh.points) - np.asarray(self.matrix @ system.points)
 
     def surface(self, x: Floats) -> Floats:
@@ -152,9 +145,8 @@ class ShellPulls(Pulls):
         return super().surface(x) + self.shift
 
 
-def node_mass(solid: Solid, skin: Skin, rows: int) -> Floats:
-    """Return the mass of each row, (rows,) [kg]: what the outer nodes have is on the inner ones, rotations have none."""
-    out = np.zeros(rows)
-    out[: len(skin.used)] = solid.node_mass[skin.used]
+def node_mass(solid: Solid, skin: Skin) -> Floats:
+    """Return the mass of each row, (k + m,) [kg]: what the outer nodes have is on the inner ones, rotations have none."""
+    out = np.concatenate([skin.rest.mass(solid), np.zeros(len(skin.arm))])
     np.add.at(out, skin.carrier, solid.node_mass[skin.layer.outer])
     return out
