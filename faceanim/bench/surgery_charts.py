@@ -97,7 +97,7 @@ def chart(rows: Sequence[Row], path: Path) -> None:
     errors.set_title("without noise")
     shares.set_ylabel("moved skin within 1.5 mm [%]")
     shares.set_title("with noise; dotted: published, one patient")
-    shares.set_ylim(70.0, 101.0)
+    shares.set_ylim(60.0, 101.0)
     for axes in (errors, shares):
         axes.set_xticks(range(len(moves)), [m.replace("_", " ") for m in moves], rotation=20, ha="right")
         axes.spines[["top", "right"]].set_visible(False)

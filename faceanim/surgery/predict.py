@@ -88,9 +88,12 @@ def _bone_contact(face: Face, grids: tuple[DistanceGrid, ...]) -> BoneContact:
 
 
 def _stays(face: Face) -> Bools:
-    """Return the skin that no operation moves: scalp, ears and the collar, (n,)."""
-    collar = (face.region == attach.NECK) & face.pinned
-    return np.asarray((face.region == attach.SCALP) | (face.region == attach.EAR) | collar)
+    """Return the skin that no operation moves: scalp, ears, the collar and the depth of the lids, (n,).
+
+    Lids end on the eyeball, which stays where it is.
+    """
+    ends = np.isin(face.region, (attach.NECK, attach.LID)) & face.pinned
+    return np.asarray((face.region == attach.SCALP) | (face.region == attach.EAR) | ends)
 
 
 def _weights(operation: Operation, points: Floats, weight: Floats, stays: Bools) -> Floats:

@@ -145,6 +145,7 @@ def test_all_models_follow_the_bone(model: str) -> None:
     assert 0.3 < lift.mean() < 0.55
 
 
+@pytest.mark.slow
 def test_published_constants_are_unstable_and_said_so() -> None:
     """Under the printed Mooney-Rivlin constants the limits are told before a run, and what goes beyond them after it."""
     made = solver(slab(published=True), law="mooney_rivlin", shell=False)

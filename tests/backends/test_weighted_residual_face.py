@@ -75,6 +75,7 @@ def slab() -> Body:
     return replace(body, muscles=Muscles(("pull",), np.array([300.0]), *fibres))
 
 
+@pytest.mark.slow
 def test_patches_answer_as_the_whole_does() -> None:
     """On flesh held by bone the superposed patches have the direction and nearly the size of the whole's answer."""
     body = slab()

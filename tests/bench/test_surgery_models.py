@@ -27,12 +27,12 @@ def test_noise_has_its_size_and_length() -> None:
     """Along the normals only, with the declared deviation, and correlated by 1/e over the declared length."""
     points = sheet()
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    drawn = np.stack([noise(points, normals, seed)[:, 2] for seed in range(20)]).reshape(20, 60, 60)
+    drawn = np.stack([noise(points, normals, seed)[:, 2] for seed in range(6)]).reshape(6, 60, 60)
     assert np.abs(noise(points, normals, 0)[:, :2]).max() == 0.0
-    assert drawn.std() == pytest.approx(SIGMA, rel=0.05)
+    assert drawn.std() == pytest.approx(SIGMA, rel=0.1)
     lag = int(LENGTH)
     correlation = (drawn[:, :, lag:] * drawn[:, :, :-lag]).mean() / drawn.var()
-    assert correlation == pytest.approx(np.exp(-1.0), abs=0.08)
+    assert correlation == pytest.approx(np.exp(-1.0), abs=0.1)
     np.testing.assert_array_equal(noise(points, normals, 3), noise(points, normals, 3))
 
 

@@ -226,6 +226,7 @@ def test_bad_input_is_named() -> None:
         follow(elements, contact, up(1.0), fixed=held[:3])
 
 
+@pytest.mark.slow
 def test_an_impossible_way_is_an_error() -> None:
     """A bone that goes right through held flesh leaves no balance, and that is said, not returned."""
     elements = slab((4, 4, 1), size=(20.0, 20.0, 3.0))

@@ -71,6 +71,7 @@ def test_linear_reading_keeps_the_interpolation_bound(ball: BoneField) -> None:
     assert error.max() > 0.3 * bound.min()
 
 
+@pytest.mark.slow
 def test_error_falls_with_the_spacing() -> None:
     """Halving the lattice divides the error of eq 7 by 4; the spline's is a tenth of it."""
     points, r = shells(2.0)
