@@ -105,12 +105,13 @@ def solver_options(args: argparse.Namespace) -> Any:
         if name not in known:
             raise unknown_name(f"option of backend {args.backend}", name, known)
         if isinstance(value, str):
-            wanted[name] = _typed(value, getattr(cls(), name), name)
+            wanted[name] = _typed(value, getattr(cls(), name), name, flag="bool" in str(known[name].type))
     return cls(**wanted)
 
 
-def _typed(text: str, default: Any, name: str) -> Any:
-    if isinstance(default, bool):
+def _typed(text: str, default: Any, name: str, *, flag: bool) -> Any:
+    """Return `text` as what the `default` of an option is; `flag`: it is true or false, by default perhaps neither."""
+    if flag:
         if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
             raise UserError(f"--option {name}={text}: true or false is needed")
         return text.lower() in ("true", "yes", "1")

@@ -148,11 +148,13 @@ class Newton:
 
     def energy(self, x: Floats, force: Floats) -> float:
         """Return the energy less the work of `force` [uJ]; infinite where a law with a barrier is inverted."""
-        total = self.elements.energy(x)
-        if not np.isfinite(total):
-            return np.inf
         moved = float((force * (x - self.elements.points)).sum())
-        return total + sum(term.energy(x) for term in self.terms) - moved
+        with np.errstate(invalid="ignore"):  # an unstable law may have energies without bound, both ways
+            total = self.elements.energy(x)
+            if not np.isfinite(total):
+                return np.inf
+            total += sum(term.energy(x) for term in self.terms) - moved
+        return np.inf if np.isnan(total) else total
 
     def forces(self, x: Floats) -> tuple[Floats, float]:
         """Return elastic and term forces, (n, 3) [mN], and the largest single one."""

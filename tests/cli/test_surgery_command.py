@@ -15,7 +15,9 @@ import pytest
 import trimesh
 
 from faceanim.backends import BACKENDS
-from faceanim.cli.main import main
+from faceanim.cli.choices import solver_options
+from faceanim.cli.main import build_parser, main
+from faceanim.ground.errors import UserError
 
 QUICK = ["--density", "coarse", "--preview", "--size", "96", "--quiet"]
 MADE = {
@@ -201,3 +203,14 @@ def test_the_papers_mid_face_advance(tmp_path: Path) -> None:
     assert record["seconds"]["solve"] < 60.0
     assert 5.0 < record["movement_mm"]["nose"]["signed_mean"] < 12.0
     assert record["movement_mm"]["forehead"]["max"] < 0.5
+
+
+def test_flags_without_a_default_are_read() -> None:
+    """`--option shell=false` is a flag although its default is neither true nor false."""
+    parser = build_parser("surgery")
+    asked = ["surgery", "genioplasty", "--backend", "mixed_fem"]
+    args = parser.parse_args([*asked, "--option", "shell=false", "--option", "pressure=yes"])
+    options = solver_options(args)
+    assert options.shell is False and options.pressure is True and options.homogeneous is None
+    with pytest.raises(UserError, match="true or false is needed"):
+        solver_options(parser.parse_args([*asked, "--option", "shell=perhaps"]))

@@ -12,7 +12,7 @@ from faceanim.backends.mixed_fem.options import Options
 from faceanim.backends.mixed_fem.skin import ShellPulls, ShellTerm, Skin, node_mass
 from faceanim.backends.mixed_fem.tissues import beyond_limit, largest_stretch, limits_said, materials_of
 from faceanim.backends.newton_solver import SolverNewton
-from faceanim.backends.nodal import carry, solid_of
+from faceanim.backends.nodal import carry, push_out, solid_of
 from faceanim.backends.pulls import Pulls, coupled
 from faceanim.backends.solver import Energy, State, StepReport
 from faceanim.body.body import Body
@@ -203,8 +203,9 @@ class SolverMixedFem(SolverNewton):
         self.drag = self.elements.matrix(drag)
 
     def surface(self, state: State, out: np.ndarray) -> None:
-        """Write the surface points (n, 3) [mm] into `out`."""
+        """Write the surface points (n, 3) [mm] into `out`, moved out of the eyeballs, which the flesh does not feel."""
         out[:] = self.matrix @ self.nodes(state)
+        push_out(out, self.body)
 
     def nodes(self, state: State) -> Floats:
         """Return where all nodes of the body's solid are, (n, 3) [mm]."""
