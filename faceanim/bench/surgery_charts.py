@@ -45,9 +45,7 @@ def markdown(rows: Sequence[Row], rest: Statistics) -> str:
         published = f"{PAPER[row.model]:.0f} %" if row.model in PAPER else "-"
         start = f"| {row.move} | {LABELS.get(row.model, row.model)} | "
         if row.moved is None:
-            lines.append(
-                start + f"no balance beyond {row.fraction:.0%} | - | - | - | - | {published} | {row.seconds:.1f} |"
-            )
+            lines.append(start + f"{_ended(row)} | - | - | - | - | {published} | {row.seconds:.1f} |")
             continue
         m = row.moved
         noisy = noisy_share(rows, row)
@@ -60,6 +58,11 @@ def markdown(rows: Sequence[Row], rest: Statistics) -> str:
         f"triangulations, are {rest.mean:.2f} mm apart in the mean and {rest.p95:.2f} mm at 95 %."
     )
     return "\n".join(lines) + "\n"
+
+
+def _ended(row: Row) -> str:
+    """Return in a few words why a model has no figures."""
+    return f"no balance beyond {row.fraction:.0%}" if row.fraction < 1.0 else row.failure
 
 
 def noisy_share(rows: Sequence[Row], row: Row) -> float | None:
@@ -92,7 +95,7 @@ def chart(rows: Sequence[Row], path: Path) -> None:
         for row in bare:
             if row.model == model and row.moved is None:
                 place = moves.index(row.move) + 0.2 * (k - 1.5)
-                errors.text(place, 0.02, "no balance", rotation=90, ha="center", va="bottom", fontsize="x-small")
+                errors.text(place, 0.02, _ended(row), rotation=90, ha="center", va="bottom", fontsize="x-small")
     errors.set_ylabel("mean distance to the truth, moved skin [mm]")
     errors.set_title("without noise")
     shares.set_ylabel("moved skin within 1.5 mm [%]")

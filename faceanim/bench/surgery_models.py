@@ -152,13 +152,16 @@ def run(move: str, model: str, known: Reference, **changes: Any) -> Iterator[Row
     """Yield the figures of a model on a move: against the bare truth, then with each noise.
 
     changes : further options of the model, for ablations
+    A balance in which elements are turned inside out means nothing: it counts as failed, and has no figures.
     """
     face = load_face("default")
     options = replace(Options(model=model, tissue="craniofacial"), **changes)
     name = model + "".join(f" {k}={v}" for k, v in sorted(changes.items()))
     found = predict(face, load_plan(move), backend="mixed_fem", options=options)
-    if found.failure is not None:
-        yield Row(move, name, None, found.fraction, found.seconds["solve"], None, None, found.failure)
+    inverted = found.solver.inverted
+    failure = found.failure or (f"{inverted} elements are inverted" if inverted else None)
+    if failure is not None:
+        yield Row(move, name, None, found.fraction, found.seconds["solve"], None, None, failure)
         return
     predicted = TriMesh(found.points, face.mesh.triangles)
     _, nearest = cKDTree(known.face.mesh.points).query(face.mesh.points)

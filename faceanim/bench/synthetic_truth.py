@@ -7,7 +7,7 @@ Declared before any model was run on it, and not tuned afterwards:
   all moduli vary by up to 20 % in patches some 30 mm wide that no model knows
 - boundary: flesh is bonded to bone, but for the moist gap between the wall of the mouth and the teeth
 - noise: correlated (normal direction, sigma 0.4 mm, correlation length 4 mm), three seeds, plus what a rigid
-  registration on the unmoved upper face leaves of it
+  registration on the unmoved skin leaves of it
 The truth shares with the models the law, the constants and the bone moves, which favours them: no statement about patients.
 """
 

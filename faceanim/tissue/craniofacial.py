@@ -1,6 +1,6 @@
 """Skin, muscle and fat of the head as measured in tension, with the constants of a craniofacial surgery model.
 
-Table 1 of "An improved finite element model for craniofacial surgery simulation" (nonlinear finite mixed elements, 2009)
+Table 1 of "An improved finite element model for craniofacial surgery simulation" (nonlinear finite mixed elements)
 prints C10 and C01 in gf/mm^2 and a third column "D1" = .49, .3, .49. That column is taken as Poisson's ratio: as the
 D1 = 2/kappa of a finite element program it would mean Poisson's ratios of -.05, .24 and .37 for tissues that the text
 calls incompressible. Every digit counts: C10 and C01 nearly cancel, and 1 % of C10 is 28 % of the shear modulus of fat.

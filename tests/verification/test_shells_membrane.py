@@ -12,7 +12,7 @@ from faceanim.elements.newton import newton
 from faceanim.elements.shells import Sheet, Shells, ShellSystem
 
 TISSUES = {"skin": (18.9834587, -15.4071649), "muscle": (9.84540206, -7.74326281), "fat": (16.6131140, -16.0126823)}
-"""c10 and c01 [gf/mm^2] of Wang et al., An improved finite element model for craniofacial surgery, 2009, Table 1."""
+"""c10 and c01 [gf/mm^2] of An improved finite element model for craniofacial surgery simulation, Table 1."""
 GF = 9.80665
 """1 gf/mm^2 in kPa."""
 STRESS = {
