@@ -10,6 +10,9 @@ from faceanim.body.body import Body
 from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import UserError
 
+_ROUNDING = 1e-9
+"""By how much an activation may miss its limits."""
+
 
 @dataclass(eq=False)
 class Control:
@@ -35,7 +38,7 @@ class Control:
         return bool(self.gravity.any()) or self.force is not None
 
     def reject_unfit(self, body: Body) -> None:
-        """Raise `UserError` unless this fits `body` and holds only finite numbers."""
+        """Raise `UserError` unless this fits `body`, holds only finite numbers, and activations within 0 to 1."""
         for name, value, shape in (
             ("activation", self.activation, (len(body.muscles.names),)),
             ("bone_pose", self.bone_pose, (len(body.bones), 4, 4)),
@@ -48,3 +51,7 @@ class Control:
                 raise UserError(f"control: {name} has shape {np.shape(value)}; {shape} is needed")
             if not np.isfinite(value).all():
                 raise UserError(f"control: {name} holds a number that is not finite")
+        low, high = self.activation.min(initial=0.0), self.activation.max(initial=1.0)
+        if low < -_ROUNDING or high > 1.0 + _ROUNDING:
+            worst = low if low < -_ROUNDING else high
+            raise UserError(f"control: an activation is {worst:g}; it must be between 0 (at rest) and 1 (all force)")

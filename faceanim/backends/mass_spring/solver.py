@@ -149,7 +149,7 @@ class SolverMassSpring:
             load.x[patch.held] = load.moment.anchor[patch.held]
         report = newton.minimise(load.x, tolerance=self.options.newton_tolerance, most=self.options.newton_most)
         self.static_report = report
-        if not np.isfinite(report.residual):
+        if not (np.isfinite(report.residual) and np.isfinite(load.x).all()):
             raise DivergenceError(
                 f"the equilibrium search left the finite numbers after {report.steps} Newton steps; lower the "
                 "activations or check the body for crossings at rest"

@@ -49,6 +49,18 @@ class Model(Protocol):
     def work(self, control: Control, q: Floats, carried: Floats) -> float: ...
 
 
+def _vibrations(mass: Floats, stiff: Floats) -> tuple[Floats, Floats]:
+    """Return eigenvalues and vectors of mass against stiffness; raise `UserError` where fields do not fit the body."""
+    try:
+        period, shape = linalg.eigh(mass, stiff)
+    except linalg.LinAlgError:
+        raise UserError(
+            "weighted_residual: these trial fields are too many for this surface, so that the stiffness is not positive "
+            "definite; choose a lower degree (5) or fewer terms, or a finer mesh"
+        ) from None
+    return period, shape
+
+
 def packed(fields: Floats, weight: Floats) -> Answers:
     """Return displacements `fields` (r, n, 3) as a table by vertex; what is exactly zero is left out."""
     mode_of = np.abs(fields).max(axis=2) > 0.0
@@ -76,7 +88,7 @@ class WholeModel:
         rows = nodes.reshape(-1, nodes.shape[2])
         mass = rows.T @ (np.repeat(solid.node_mass, 3)[:, None] * rows)
         stiff = system.young * length**3 * system.matrix
-        period, shape = linalg.eigh(mass, stiff)
+        period, shape = _vibrations(mass, stiff)
         good = period > 1e-12 * period[-1]
         self.squared = 1.0 / period[good]
         self.modes = shape[:, good] * np.sqrt(self.squared)
