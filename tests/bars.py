@@ -9,46 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from faceanim.backends.modal_warping.options import Options
-from faceanim.backends.modal_warping.solver import SolverModalWarping
+from faceanim.bench import gravity_bar
+from faceanim.bench.gravity_bar import bar, displaced, hanging, mass_norm, node_at
+from faceanim.bench.gravity_bar import modal as solver_of
 from faceanim.body.body import Body, Muscles
-from faceanim.body.control import Control
 from faceanim.body.solid import solid_body
 from faceanim.geometry.shapes import box_tets
 from faceanim.tissue.material import Material
 
-
-def bar(
-    cells: tuple[int, int, int] = (10, 2, 2),
-    young: float = 1.5e5,
-    *,
-    split: str = "kuhn",
-    poisson: float = 0.3,
-    size: tuple[float, float, float] = (1.0, 0.2, 0.2),
-    **options: Any,
-) -> Body:
-    """Return the bar with its nodes at x = 0 held."""
-    mesh = box_tets(cells, size, split=split)
-    material = Material("rubber", 1000.0, young, poisson)
-    return solid_body(mesh, material, np.flatnonzero(mesh.points[:, 0] < 1e-9), **options)
-
-
-def solver_of(body: Body, modes: int = 30, variant: str = "warped", **options: Any) -> SolverModalWarping:
-    """Return the solver with these options, computed afresh."""
-    return SolverModalWarping(body, Options(modes=modes, variant=variant, **{"cache": False} | options))
-
-
-def hanging(body: Body, g: float) -> Control:
-    """Return the control with gravity `g` along -y."""
-    control = Control.rest(body)
-    control.gravity = np.array([0.0, -g, 0.0])
-    return control
-
-
-def node_at(body: Body, *point: float) -> int:
-    """Return the solid node nearest to `point` at rest."""
-    assert body.solid is not None
-    return int(np.linalg.norm(body.solid.mesh.points - point, axis=1).argmin())
+__all__ = [
+    "bar", "displaced", "growth", "hanging", "jawed_bar", "mass_norm", "node_at", "solver_of", "tip_nodes",
+    "volume_ratios",
+]  # fmt: skip
 
 
 def tip_nodes(body: Body) -> np.ndarray:
@@ -58,25 +30,14 @@ def tip_nodes(body: Body) -> np.ndarray:
     return np.flatnonzero(x > x.max() - 1e-9)
 
 
-def displaced(solver: Any, state: Any) -> np.ndarray:
-    """Return the nodal displacements (n, 3)."""
-    return np.asarray(solver.nodes(state) - solver.solid.mesh.points)
-
-
 def growth(solver: Any, u: np.ndarray) -> float:
     """Return V / V0 - 1."""
-    return float(volume_ratios(solver, u) @ solver.solid.mesh.volumes / solver.solid.mesh.volumes.sum() - 1.0)
+    return gravity_bar.growth(solver.solid, u)
 
 
 def volume_ratios(solver: Any, u: np.ndarray) -> np.ndarray:
     """Return det F of every element."""
-    mesh = solver.solid.mesh
-    return np.linalg.det(np.eye(3) + np.einsum("eai,eaj->eij", u[mesh.tets], mesh.gradients))
-
-
-def mass_norm(mass: Any, u: np.ndarray) -> float:
-    """Return |u|_M."""
-    return float(np.sqrt(u.ravel() @ (mass @ u.ravel())))
+    return gravity_bar.volume_ratios(solver.solid, u)
 
 
 def jawed_bar(split: str = "mirrored", **changes: Any) -> Body:

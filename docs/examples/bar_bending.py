@@ -13,40 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from faceanim.backends import backend_class, make_solver
+from faceanim.bench.claims.choi_ko import FIG_4_GRAVITIES, MODELS, figure_4_bar, figure_4_shapes
+from faceanim.bench.gravity_bar import flesh
 from faceanim.body.body import Body
-from faceanim.body.control import Control
-from faceanim.body.solid import solid_body
-from faceanim.geometry.shapes import box_tets
 from faceanim.render.body_scene import BodyScene
 from faceanim.render.sequence import contact_sheet, write_png
-from faceanim.tissue.material import Material
 
-GRAVITY = (1.96, 4.9, 9.8)
 COLOURS = {"linear": (0.80, 0.42, 0.33), "warped": (0.33, 0.52, 0.80), "nonlinear": (0.42, 0.68, 0.42)}
-
-
-def bar() -> Body:
-    """Return the bar of the paper's figures, a fifth as thick as long: rho g L / E = 0.065 at the largest gravity."""
-    mesh = box_tets((20, 4, 4), (1.0, 0.2, 0.2))
-    return solid_body(mesh, Material("rubber", 1000.0, 1.5e5, 0.3), np.flatnonzero(mesh.points[:, 0] < 1e-9))
-
-
-def equilibria(body: Body, gravity: float) -> dict[str, np.ndarray]:
-    """Return the surface (n, 3) of the bar at rest under `gravity`, by each model."""
-    modal = backend_class("modal_warping").Options
-    control = Control.rest(body)
-    control.gravity[:] = (0.0, -gravity, 0.0)
-    shapes = {}
-    for name, backend, options in (
-        ("linear", "modal_warping", modal(modes=30, variant="linear")),
-        ("warped", "modal_warping", modal(modes=30, variant="warped")),
-        ("nonlinear", "finite_elements", None),
-    ):
-        solver = make_solver(backend, body, options)
-        shapes[name] = body.surface.points.copy()
-        solver.surface(solver.solve_static(control), shapes[name])
-    return shapes
 
 
 def distance(body: Body, a: np.ndarray, b: np.ndarray) -> float:
@@ -56,21 +29,23 @@ def distance(body: Body, a: np.ndarray, b: np.ndarray) -> float:
 
 def main(out: str | Path) -> float:
     """Write the picture into the folder `out` and return the warped bar's error over the linear bar's [-]."""
-    body = bar()
-    results = [equilibria(body, g) for g in GRAVITY]
-    bounds = np.concatenate([body.surface.points, *(shape for result in results for shape in result.values())])
+    body = figure_4_bar()
+    solid = flesh(body)
+    found = [figure_4_shapes(g) for g in FIG_4_GRAVITIES]
+    skins = [{name: solid.skin.apply(solid.mesh.points + one.u) for name, one in models.items()} for models in found]
+    bounds = np.concatenate([body.surface.points, *(skin for models in skins for skin in models.values())])
     rows = []
-    for result in results:
+    for models in skins:
         row = []
-        for name, shape in result.items():
+        for name, skin in models.items():
             scene = BodyScene(
                 [body.surface.points], [body.surface.triangles], [COLOURS[name]], bounds, size=(300, 300), view="front"
             )
-            row.append(scene.draw([shape]).copy())
+            row.append(scene.draw([skin]).copy())
         rows.append(row)
-    labels = [f"g = {g}" for g in GRAVITY]
-    write_png(Path(out) / "bar_bending.png", contact_sheet(rows, row_labels=labels, column_labels=list(COLOURS)))
-    last = results[-1]
+    labels = [f"g = {g}" for g in FIG_4_GRAVITIES]
+    write_png(Path(out) / "bar_bending.png", contact_sheet(rows, row_labels=labels, column_labels=list(MODELS)))
+    last = skins[-1]
     return distance(body, last["warped"], last["nonlinear"]) / distance(body, last["linear"], last["nonlinear"])
 
 

@@ -6,9 +6,10 @@ import csv
 import io
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 
 from faceanim.bench.accuracy import Accuracy, full_session, measure, with_options
 from faceanim.ground.arrays import Floats
+from faceanim.ground.notes import tell
 from faceanim.session.session import Session
 
 Draw = Callable[[Floats, float], Any]
@@ -108,6 +110,34 @@ def frame_rate(
         drawing.append(perf_counter() - start)
     numba.set_num_threads(threads)
     return table_row(session, drawing, list(measure(session, positions))[-1] if accuracy else None)
+
+
+def frame_rates(
+    sessions: Sequence[Session],
+    draw: Callable[[Session, Floats, float], Any] | None = None,
+    *,
+    accuracy: bool = True,
+    drawing_threads: int | None = None,
+) -> Iterator[Row]:
+    """Yield the row of each session, simulated on one core and drawn on `drawing_threads`; compile before anything.
+
+    draw : draws a frame of a session from its positions and time; None = simulation only
+    Partitions are computed anew, so that their cost is measured.
+    """
+    threads = numba.get_num_threads()
+    first = sessions[0]
+    first.solver.step(first.solver.rest(), first.solver.rest(), first.control(0.1), first.dt)
+    first.solver.solve_static(first.control(0.1))
+    try:
+        for session in sessions:
+            tell(f"measuring {session.expression.name}")
+            numba.set_num_threads(1)
+            with fresh_partitions():
+                session.warm()
+            one = None if draw is None else partial(draw, session)
+            yield frame_rate(session, one, accuracy=accuracy, drawing_threads=drawing_threads or threads)
+    finally:
+        numba.set_num_threads(threads)
 
 
 def table_row(session: Session, drawing: list[float], accuracy: Accuracy | None) -> Row:

@@ -144,3 +144,17 @@ def _scale(colour: str, values: Sequence[Floats]) -> Scale:
 def _round_up(value: float) -> float:
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0) if step * power >= value))
+
+
+def session_drawer(size: int) -> Callable[[Session, Floats, float], Any]:
+    """Return what draws a frame of any session of one face, `size` pixels wide, from its positions and time."""
+    drawing: Drawing | None = None
+
+    def draw(session: Session, points: Floats, t: float) -> Any:
+        nonlocal drawing
+        if drawing is None:
+            drawing = Drawing(session, Picture((size, size)))
+        drawing.session = session
+        return drawing.draw(points, session.timeline.at(t))
+
+    return draw

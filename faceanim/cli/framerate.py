@@ -70,40 +70,21 @@ def _sessions(args: argparse.Namespace) -> list[Any]:
     if not expressions:
         raise UserError("--expressions names none; leave it out to measure all")
     options = solver_options(args)
-    face = load_face(args.face, args.density)
+    face = load_face(args.face, args.density or "default")
     body = face.body()
     return [Session(face, one, fps=fps, backend=args.backend, options=options, body=body) for one in expressions]
 
 
 def _measure(sessions: list[Any], size: int, threads: int, progress: Progress, *, accuracy: bool) -> list[Row]:
     """Simulate on one core and draw on `threads`; return one row per expression."""
-    import numba
+    from faceanim.bench.framerate import frame_rates
+    from faceanim.cli.drawing import session_drawer
+    from faceanim.ground.notes import listening
 
-    from faceanim.bench.framerate import frame_rate, fresh_partitions
-    from faceanim.cli.drawing import Drawing, Picture
-
-    drawing = Drawing(sessions[0], Picture((size, size))) if size else None
-    rows = []
     progress.stage("compiling what is not compiled yet")
-    first = sessions[0]
-    first.solver.step(first.solver.rest(), first.solver.rest(), first.control(0.1), first.dt)
-    first.solver.solve_static(first.control(0.1))
-    progress.stage("measuring", len(sessions))
-    for session in sessions:
-        progress.detail(session.expression.name)
-
-        def draw(points: Any, t: float, session: Any = session) -> None:
-            assert drawing is not None
-            drawing.session = session
-            drawing.draw(points, session.timeline.at(t))
-
-        numba.set_num_threads(1)
-        with fresh_partitions():
-            session.warm()
-        rows.append(frame_rate(session, draw if drawing else None, accuracy=accuracy, drawing_threads=threads))
-        progress.advance()
-    numba.set_num_threads(threads)
-    return rows
+    draw = session_drawer(size) if size else None
+    with listening(progress.hear):
+        return list(frame_rates(sessions, draw, accuracy=accuracy, drawing_threads=threads))
 
 
 def _print(rows: list[Row], shares: list[Any], computer: dict[str, Any]) -> None:
