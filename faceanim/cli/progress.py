@@ -18,15 +18,18 @@ class Progress:
         self._bar: Any = None
         self._task: Any = None
         self._text, self._total, self._done = "", 0, 0
-        self._spoke = perf_counter()
+        self._spoke = self._began = perf_counter()
 
     def __enter__(self) -> Progress:
         if not self._quiet and sys.stderr.isatty():
             from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
             from rich.progress import Progress as RichProgress
 
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+            columns = (
+                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+                TimeRemainingColumn(),
+            )  # fmt: skip
             self._bar = RichProgress(*columns, console=Console(stderr=True), transient=True)
             self._bar.start()
         return self
@@ -47,6 +50,7 @@ class Progress:
     def stage(self, text: str, total: int = 0) -> None:
         """Begin a stage of `total` units of work (0 = unknown)."""
         self._text, self._total, self._done = text, total, 0
+        self._began = perf_counter()
         if self._bar is not None:
             if self._task is not None:
                 self._bar.remove_task(self._task)
@@ -61,8 +65,16 @@ class Progress:
         if self._bar is not None:
             self._bar.advance(self._task)
         elif not self._quiet and perf_counter() - self._spoke > _SILENCE:
-            self.note(f"{self._text}: {self._done}/{self._total}")
+            self.note(f"{self._text}: {self._done}/{self._total}{self._left()}")
             self._spoke = perf_counter()
+
+    def _left(self) -> str:
+        """Return in words how long the rest of the stage will take if it goes on as so far, once that is a while."""
+        share = self._done / self._total if self._total else 0.0
+        seconds = (perf_counter() - self._began) * (1.0 / share - 1.0) if share > 0.0 else 0.0
+        if seconds < 10.0:
+            return ""
+        return f", about {seconds:.0f} s left" if seconds < 100.0 else f", about {seconds / 60.0:.0f} min left"
 
     def hear(self, what: str, done: int, total: int) -> None:
         """Show what a long computation tells (`ground.notes`) as a stage of its own."""
