@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 def add_face(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
     """Declare whose head it is."""
     parser.add_argument("--face", default="default", help="name of the face (default: %(default)s)")
-    parser.add_argument("--density", default="default", help="coarse, default or fine")
+    parser.add_argument("--density", help="coarse, default or fine")
 
 
 def face_asked(args: argparse.Namespace) -> Face:
     """Return the face that the command line names, with muscles of one's own if it gives a list of them."""
     from faceanim.face.library import load_face, read_muscles
 
-    face: Face = load_face(args.face, args.density)
+    face: Face = load_face(args.face, args.density or "default")
     source = getattr(args, "own_muscles", None)
     return face if source is None else face.with_muscles(read_muscles(source), str(source))
 
@@ -34,8 +34,7 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     add_face(group)
     group.add_argument("--muscles", dest="own_muscles", metavar="FILE",
                        help="muscles of one's own, as `faceanim muscles map` writes them")  # fmt: skip
-    group.add_argument("--backend", default="mass_spring",
-                       help="how flesh answers (`faceanim info backends`; default: %(default)s)")  # fmt: skip
+    group.add_argument("--backend", help="how flesh answers (`faceanim info backends`; default: mass_spring)")
     group.add_argument(
         "--scheme",
         help="time stepping of mass_spring: conjugate_gradient, block_descent, newton, explicit, semi_implicit or paper",
@@ -44,7 +43,8 @@ def add_simulation(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--adaptive", dest="adaptive", action="store_true", default=None,
                        help="dynamic, quasi-static and static vertices (default)")  # fmt: skip
     which.add_argument("--full", dest="adaptive", action="store_false", help="every vertex dynamic")
-    group.add_argument("--tolerance", metavar="MM", help="what the adaptive partition may cost in accuracy [mm]")
+    group.add_argument("--partition-tolerance", metavar="MM",
+                       help="what the adaptive partition may cost in accuracy [mm]")  # fmt: skip
     group.add_argument("--threads", metavar="N", help="processor cores to use (default: one to simulate, all to draw)")
     group.add_argument("--option", metavar="NAME=VALUE", action="append", default=[],
                        help="any other option of the backend (`faceanim info backends`)")  # fmt: skip
@@ -83,17 +83,19 @@ def use_threads(text: str | None) -> int:
 def solver_options(args: argparse.Namespace) -> Any:
     """Return the backend's Options as the command line asks for; adaptive unless it says --full.
 
+    Settles `args.backend` where it is left open.
     Raises `UserError` for an option or a value that this backend does not know.
     """
     from faceanim.backends import backend_class
 
+    args.backend = args.backend or "mass_spring"
     cls = backend_class(args.backend).Options
     known = {f.name: f for f in fields(cls)}
     wanted: dict[str, Any] = {}
     if args.scheme is not None:
         wanted["scheme"] = args.scheme
-    if args.tolerance is not None:
-        wanted["tolerance"] = number(args.tolerance, "--tolerance", 0.0, 10.0, above=True)
+    if args.partition_tolerance is not None:
+        wanted["tolerance"] = number(args.partition_tolerance, "--partition-tolerance", 0.0, 10.0, above=True)
     if args.adaptive is not None or "adaptive" in known:
         wanted["adaptive"] = args.adaptive is not False
     for setting in args.option:

@@ -8,10 +8,12 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from faceanim.cli.choices import add_simulation, face_asked, number, solver_options, use_threads, whole
-from faceanim.ground.errors import UserError, unknown_name
+from faceanim.ground.errors import RunError, UserError, unknown_name
 
 if TYPE_CHECKING:
+    from faceanim.bench.comparison.plan import Plan
     from faceanim.cli.drawing import Picture
+    from faceanim.cli.progress import Progress
     from faceanim.expression.expression import Expression
     from faceanim.expression.timeline import Timeline
     from faceanim.session.session import Session
@@ -42,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     time.add_argument("--fps", default="30", metavar="N", help="frames per second (default: %(default)s)")
     time.add_argument("--duration", metavar="S", help="seconds to show (default: the whole expression)")
     add_simulation(parser)
+    plan = parser.add_argument_group("plan")
+    plan.add_argument("--tolerance", metavar="MM", help="RMS error over the face that is allowed: chooses backend, scheme, "
+                      "density, step and partition, the cheapest that keep up with --fps (see `faceanim plan`)")  # fmt: skip
+    plan.add_argument("--against", metavar="WHAT", default="reference",
+                      help="what it counts from: reference (default), or own: the model's converged motion")  # fmt: skip
     _add_picture(parser.add_argument_group("picture"))
 
 
@@ -110,8 +117,44 @@ def timeline_asked(args: argparse.Namespace, expression: Expression) -> Timeline
     return replace(line, tau_on=0.03, tau_off=0.06) if args.lag else line
 
 
-def session_asked(args: argparse.Namespace) -> Session:
-    """Return the session that the command line describes; nothing has been simulated yet."""
+PLANNED = {"scheme": "--scheme", "adaptive": "--adaptive or --full", "option": "--option",
+           "partition_tolerance": "--partition-tolerance", "own_muscles": "--muscles"}  # fmt: skip
+"""What cannot be said beside --tolerance, which chooses it, or knows the built-in muscles only."""
+
+
+def plan_asked(args: argparse.Namespace, progress: Progress) -> Plan | None:
+    """Return the plan for --tolerance and --fps, None if they leave nothing to plan.
+
+    Raises `UserError` for what contradicts it, `RunError` if nothing meets both.
+    """
+    if args.tolerance is None:
+        return None
+    for name, flag in PLANNED.items():
+        if getattr(args, name):
+            raise UserError(f"--tolerance and {flag} exclude each other; leave one of them out")
+    from faceanim.bench.comparison.plan import MEASURES, RATES, TOLERANCES
+    from faceanim.bench.comparison.scenes import expression_scene, scene_named
+    from faceanim.cli.plan import plan_shown
+    from faceanim.expression.library import expression_names
+
+    tolerance = number(args.tolerance, "--tolerance", *TOLERANCES)
+    fps = number(args.fps, "--fps", *RATES)
+    if args.against not in MEASURES:
+        raise unknown_name("measure of accuracy", args.against, MEASURES)
+    own = args.au or args.activation or args.jaw or args.name not in expression_names()
+    scene = expression_scene(expression_asked(args)) if own else scene_named(f"face-{args.name}")
+    found = plan_shown(
+        progress, scene, tolerance, fps, against=args.against, backends=tuple(filter(None, [args.backend])),
+        densities=tuple(filter(None, [args.density])),
+    )  # fmt: skip
+    if found.chosen is None:
+        raise RunError(found.sentence())
+    progress.note(found.sentence())
+    return found
+
+
+def session_asked(args: argparse.Namespace, plan: Plan | None = None) -> Session:
+    """Return the session that the command line describes, as a plan chooses; nothing has been simulated yet."""
     from faceanim.session import session as limits
 
     fps = number(args.fps, "--fps", *limits.FPS_LIMITS)
@@ -120,7 +163,15 @@ def session_asked(args: argparse.Namespace) -> Session:
         duration = number(args.duration, "--duration", 0.0, limits.LONGEST, above=True)
     expression = expression_asked(args)
     timeline = timeline_asked(args, expression)
-    options = solver_options(args)
+    step = 1.0 / 30.0
+    if plan is None or plan.chosen is None:
+        options = solver_options(args)
+    else:
+        from faceanim.bench.comparison.candidates import candidate_of
+
+        row = plan.chosen.row
+        args.backend, args.density, step = row.backend, row.density, row.step
+        options = candidate_of(row).options()
     return limits.Session(
         face_asked(args),
         expression,
@@ -129,6 +180,7 @@ def session_asked(args: argparse.Namespace) -> Session:
         duration=duration,
         backend=args.backend,
         options=options,
+        largest_step=step,
     )
 
 
@@ -149,12 +201,13 @@ def run(args: argparse.Namespace) -> int:
     results = Results(Path(args.out), overwrite=args.force)
     use_threads(args.threads)
     with Progress(quiet=args.quiet) as progress, listening(progress.hear):
+        plan = plan_asked(args, progress)
         progress.stage("loading the face")
-        session = session_asked(args)
+        session = session_asked(args, plan)
         for notice in cache_notice():
             progress.note(notice)
         with results, drawing_compiled() as finish:
-            production = Production(session, picture, results, progress, start)
+            production = Production(session, picture, results, progress, start, plan)
             production.simulate()
             progress.stage("preparing to draw")
             finish()

@@ -17,6 +17,10 @@ from faceanim.ground.errors import FaceanimError, UserError, unknown_name
 COMMANDS = {
     "express": "make pictures and a film of a face that shows an expression",
     "framerate": "measure speed and accuracy for every expression, beside the published figures",
+    "compare": "chart error against cost for every backend, scheme, density and step on a scene",
+    "atlas": "map where every scheme is stable, and where it fails and how",
+    "plan": "choose the cheapest way to animate a scene that is accurate and fast enough",
+    "claims": "measure what the papers print, figure by figure: ours beside theirs, with a verdict",
     "surgery": "cut and move facial bones as a plan says and predict the skin",
     "studio": "animate a face and place its muscles in the browser",
     "muscles": "read, draw and check facial muscle images",

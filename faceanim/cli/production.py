@@ -6,7 +6,7 @@ import re
 from contextlib import ExitStack
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,9 @@ from faceanim.session.session import Session
 SHEET_VIEWS = ("front", "three_quarter", "side")
 SHEET_VIEW = 360
 POINTS = "points.npy"
+
+if TYPE_CHECKING:
+    from faceanim.bench.comparison.plan import Plan
 
 
 def faults(found: Soundness, allowed: float = 0.1) -> list[str]:
@@ -42,7 +45,16 @@ class Production:
     start : when the command began, on the clock of `perf_counter`
     """
 
-    def __init__(self, session: Session, picture: Picture, results: Results, progress: Progress, start: float) -> None:
+    def __init__(
+        self,
+        session: Session,
+        picture: Picture,
+        results: Results,
+        progress: Progress,
+        start: float,
+        plan: Plan | None = None,
+    ) -> None:
+        self.plan = plan
         self.session, self.picture, self.results, self.progress = session, picture, results, progress
         self.start, self.first_picture = start, 0.0
         self.apex = apex_frame(session)
@@ -175,6 +187,7 @@ class Production:
                 "step_s": session.dt,
             },
             "backend": {"name": session.backend, "options": session.options},
+            "plan": None if self.plan is None else self.plan.record(),
             "picture": self.picture,
             "machine": machine(),
             "table_1": self.row(),

@@ -20,6 +20,7 @@ from faceanim.expression.library import load_expression
 from faceanim.expression.timeline import Timeline
 from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import DivergenceError, UserError
+from faceanim.session.command import Command
 
 if TYPE_CHECKING:
     from faceanim.face.face import Face
@@ -86,7 +87,8 @@ class Session:
         self.frame_count = _frame_count(fps, self.duration)
         self.body = face.body() if body is None else body
         self.options = backend_class(backend).Options() if options is None else options
-        self.drive = expression.drive(self.body.muscles.names)
+        self._command = Command(face, self.body, expression)
+        self.drive = self._command.drive
         self.solver: Solver = make_solver(backend, self.body, self.options)
         self.backend = backend
         limit = min(self.solver.dt_max, largest_step)
@@ -94,20 +96,12 @@ class Session:
             raise UserError(f"backend {backend}: the largest step is {limit} s; it must be positive")
         self.steps_per_frame = max(1, math.ceil(1.0 / fps / limit - 1e-9))
         self.dt = 1.0 / fps / self.steps_per_frame
-        self._jaw = next((k for k, bone in enumerate(self.body.bones) if bone.name == "jaw"), None)
         self.timings = Timings()
         self._warm = False
 
     def control(self, intensity: float, out: Control | None = None) -> Control:
         """Return the control at `intensity` [0, 1] of the expression, written into `out` if given."""
-        out = Control.rest(self.body) if out is None else out
-        np.multiply(self.drive.activation, intensity, out=out.activation)
-        if self._jaw is not None:
-            jaw = self.drive.jaw
-            out.bone_pose[self._jaw] = self.face.jaw.pose(
-                intensity * jaw.opening, intensity * jaw.lateral, intensity * jaw.protrusion
-            )
-        return out
+        return self._command.at(intensity, out)
 
     def warm(self) -> None:
         """Prepare the solver for this expression and compile what it needs, so that frames are timed warm."""
