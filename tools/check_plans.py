@@ -13,12 +13,13 @@ from pathlib import Path
 
 from make_references import UNSEEN
 
+from faceanim.bench.alone import alone
 from faceanim.bench.comparison.candidates import candidate_of
 from faceanim.bench.comparison.memory import machine_name, plan_for
 from faceanim.bench.comparison.plan import cost
 from faceanim.bench.comparison.rows import Row, worst
 from faceanim.bench.comparison.scenes import scene_named
-from faceanim.bench.comparison.sweep import Sweep, alone
+from faceanim.bench.comparison.sweep import Sweep
 from faceanim.cli.progress import Progress
 from faceanim.ground.folders import user_cache
 from faceanim.ground.notes import listening

@@ -24,6 +24,7 @@ from faceanim.cli.drawing import Drawing, Picture
 from faceanim.cli.main import main as faceanim
 from faceanim.face.face import Face
 from faceanim.face.muscle_image import map_picture
+from faceanim.ground.folders import user_cache
 from faceanim.render.muscle_picture import muscle_image, muscle_views
 from faceanim.render.sequence import contact_sheet, write_png
 from faceanim.render.tissue_picture import draw_cut
@@ -155,6 +156,37 @@ def operations() -> None:
             (DOCS / f"bones_{plan}.png").write_bytes((out / "bones.png").read_bytes())
 
 
+def comparisons(work: Path) -> None:
+    """Compare the backends on every scene, on a smile in full, and keep charts, fronts and one page's pictures in docs/."""
+    faceanim(["compare", "face-smile", "--limit", "240", "--out", str(work / "face-smile-full")])
+    faceanim(["compare", "all", "--quick", "--out", str(work)])
+    copied(work / "face-smile-full", {"comparison.png": "comparison.png", "comparison.csv": "comparison.csv"})
+    copied(work, {"overview.png": "fronts.png", "fronts.md": "fronts.md"})
+
+
+def stability(work: Path) -> None:
+    """Make the stability maps of skin and bar and keep the overview and some of the maps in docs/."""
+    for scene in ("sheet", "bar"):
+        faceanim(["atlas", scene, "--out", str(work / f"atlas-{scene}")])
+    copied(work / "atlas-sheet", {"atlas.png": "atlas.png"})
+    copied(work / "atlas-bar", {"atlas.png": "atlas_bar.png"})
+
+
+def claims(work: Path) -> None:
+    """Measure the papers' claims and keep tables and pictures in docs/claims/ and the overview in docs/claims.md."""
+    faceanim(["claims", "all", "--out", str(work / "claims")])
+    (DOCS / "claims").mkdir(exist_ok=True)
+    for made in sorted((work / "claims").iterdir()):
+        (DOCS / "claims" / made.name).write_bytes(made.read_bytes())
+    copied(work / "claims", {"claims.md": "claims.md"})
+
+
+def copied(folder: Path, names: dict[str, str]) -> None:
+    """Copy files of `folder` into docs/ under other names."""
+    for name, ours in names.items():
+        (DOCS / ours).write_bytes((folder / name).read_bytes())
+
+
 def main_of(example: str) -> Any:
     """Return the function `main` of a script in docs/examples."""
     return runpy.run_path(str(DOCS / "examples" / f"{example}.py"))["main"]
@@ -164,7 +196,7 @@ def insert_tables() -> None:
     """Put the tables of docs/ between their marks in README.md."""
     readme = ROOT / "README.md"
     text = readme.read_text(encoding="utf-8")
-    for name in ("framerate", "faithfulness", "muscles", "face_backends", "four_models"):
+    for name in ("framerate", "faithfulness", "muscles", "face_backends", "four_models", "fronts", "claims"):
         if not (DOCS / f"{name}.md").exists():
             continue
         table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
@@ -175,12 +207,14 @@ def insert_tables() -> None:
 
 
 PARTS = ("pictures", "muscles", "gallery", "surgery", "framerate", "faithfulness", "insert")
+LONG_PARTS = ("comparisons", "stability", "claims")
+"""Made only when asked for: an hour together. They go on where they stopped, in the user's cache."""
 
 
 def main() -> None:
     """Make everything, or what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=PARTS)
+    parser.add_argument("--only", choices=(*PARTS, *LONG_PARTS))
     only = parser.parse_args().only
     DOCS.mkdir(exist_ok=True)
     apex = Apex("default")
@@ -196,6 +230,10 @@ def main() -> None:
         (DOCS / "faithfulness.md").write_text(faithfulness(apex.face), encoding="utf-8")
     if only in (None, "framerate"):
         faceanim(["framerate", "--out", str(DOCS)])
+    work = user_cache() / "docs"
+    for name, make in zip(LONG_PARTS, (comparisons, stability, claims), strict=True):
+        if only == name:
+            make(work)
     insert_tables()
 
 

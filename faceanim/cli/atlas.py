@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Try what is missing, draw everything, and print how many cells ended how."""
+    from faceanim.bench.alone import alone
     from faceanim.bench.atlas.cells import Store
     from faceanim.bench.atlas.maps import FULL, QUICK, SCENES, USUAL
     from faceanim.bench.atlas.plans import plans
@@ -48,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.out)
     make_folder(folder)
     computer = machine()
-    store = Store(folder / NAMES[0], f"{computer['processor']}, {computer['cores']} cores")
-    with Progress(quiet=args.quiet) as progress:
+    with alone(folder), Progress(quiet=args.quiet) as progress:
+        store = Store(folder / NAMES[0], f"{computer['processor']}, {computer['cores']} cores")
         filled = _fill(planned, store, progress)
         progress.stage("drawing")
         _draw(folder, store)

@@ -19,7 +19,7 @@ NAMES = ("comparison.json", "comparison.csv", "comparison.png", "comparison.html
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `faceanim compare`."""
     parser.add_argument(
-        "scene", nargs="?", metavar="SCENE", help="what to compare on; without it the scenes are listed"
+        "scene", nargs="?", metavar="SCENE", help="what to compare on, or all; without it the scenes are listed"
     )
     parser.add_argument("--out", metavar="DIR", help="folder for table, chart and page (default: compare-SCENE)")
     parser.add_argument("--quick", action="store_true", help="a tenth of the candidates, within three minutes")
@@ -45,8 +45,18 @@ def run(args: argparse.Namespace) -> int:
             print(f"{one.name:14}  {one.title}. {one.about}")
         print("face-NAME, face-NAME@0.5: any expression of the library, at an intensity")
         return 0
-    scene = scene_named(args.scene)
     limit = number(args.limit, "--limit", 1.0, 86400.0)
+    every = args.scene == "all"
+    scenes = list(SCENES.values()) if every else [scene_named(args.scene)]
+    base = Path(args.out or f"compare-{args.scene}")
+    comparisons = [_compared(args, scene, base / scene.name if every else base, limit) for scene in scenes]
+    if every:
+        _overview(comparisons, base)
+    return 0
+
+
+def _compared(args: argparse.Namespace, scene: Scene, folder: Path, limit: float) -> Comparison:
+    """Measure one scene, write its files and print its front."""
     from faceanim.bench.comparison.candidates import candidates
     from faceanim.bench.comparison.memory import machine_name, remember
     from faceanim.bench.comparison.sweep import Sweep
@@ -54,7 +64,6 @@ def run(args: argparse.Namespace) -> int:
     from faceanim.ground.notes import listening
 
     chosen = candidates(scene.name, quick=args.quick, backends=words(args.backends), densities=words(args.densities))
-    folder = Path(args.out or f"compare-{scene.name}")
     with Progress(quiet=args.quiet) as progress, listening(progress.hear):
         progress.stage(f"what {scene.name} is measured against")
         sweep = Sweep(scene, chosen, folder, limit=limit, again=args.again)
@@ -64,7 +73,18 @@ def run(args: argparse.Namespace) -> int:
         comparison = presented(scene, comparison, folder)
     _print(comparison)
     print(f"saved {', '.join(NAMES)} in {folder}")
-    return 0
+    return comparison
+
+
+def _overview(comparisons: list[Comparison], folder: Path) -> None:
+    """Write the fronts of all scenes as one picture and one table."""
+    from faceanim.bench.comparison.charts import overview_chart
+    from faceanim.bench.comparison.fronts import as_markdown
+    from faceanim.ground.files import write_whole
+
+    overview_chart(comparisons, folder / "overview.png")
+    write_whole(folder / "fronts.md", as_markdown(comparisons).encode())
+    print(f"saved overview.png, fronts.md in {folder}")
 
 
 def _watcher(progress: Progress, total: int) -> Any:
@@ -76,10 +96,19 @@ def _watcher(progress: Progress, total: int) -> Any:
         if not begun:
             progress.stage("measuring", total)
             begun = True
-        progress.detail(row.label)
         progress.advance()
+        progress.detail(f"{row.label}: {_came_out(row)}")
 
     return watch
+
+
+def _came_out(row: Row) -> str:
+    """Return in a few words what was measured."""
+    if not row.counts or row.frame_ms is None:
+        return row.outcome
+    from faceanim.bench.comparison.rows import worst
+
+    return f"{row.frame_ms:.3g} ms a frame, {worst(row):.3g} mm"
 
 
 def presented(scene: Scene, comparison: Comparison, folder: Path) -> Comparison:
@@ -98,13 +127,24 @@ def presented(scene: Scene, comparison: Comparison, folder: Path) -> Comparison:
     return comparison
 
 
+def _failures(rows: list[Row]) -> list[str]:
+    """Return a line for each way in which candidates of a backend failed, all with the same reason together."""
+    alike: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        if row.outcome != "done":
+            alike.setdefault((row.backend, row.outcome, row.reason), []).append(row.label)
+    return [
+        f"{labels[0]}{f' and {len(labels) - 1} more of {backend}' if len(labels) > 1 else ''}: {outcome}: {reason}"
+        for (backend, outcome, reason), labels in alike.items()
+    ]
+
+
 def _print(comparison: Comparison) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from faceanim.bench.comparison.rows import front, worst
 
-    failed = [row for row in comparison.rows if row.outcome != "done"]
     table = Table(
         title=f"{comparison.title}: the front, cheapest first", title_justify="left",
         caption=f"against {comparison.reference}; known to {comparison.uncertainty:.2g} mm", caption_justify="left",
@@ -121,5 +161,5 @@ def _print(comparison: Comparison) -> None:
     if not console.is_terminal:
         console = Console(width=170)
     console.print(table)
-    for row in failed:
-        console.print(f"{row.label}: {row.outcome}: {row.reason}", markup=False, highlight=False)
+    for line in _failures(comparison.rows):
+        console.print(line, markup=False, highlight=False)

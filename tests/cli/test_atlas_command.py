@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from faceanim.bench.alone import alone
 from faceanim.bench.atlas import cells as atlas
 from faceanim.cli.atlas import NAMES
 from faceanim.cli.main import main
@@ -45,7 +46,7 @@ def test_maps_are_made_once(capsys: pytest.CaptureFixture[str], monkeypatch: pyt
     assert main(WORDS) == 0
     first = capsys.readouterr().out
     assert "sheet" in first and "saved" in first
-    assert {p.name for p in Path("atlas").iterdir()} == {*NAMES, "sheet_turn.png"}
+    assert {p.name for p in Path("atlas").glob("[!.]*")} == {*NAMES, "sheet_turn.png"}
     kept = json.loads(Path("atlas/atlas.json").read_text())
     assert all(cell["outcome"] == "converged" for cell in kept["maps"][0]["cells"].values())
     tried: list[object] = []
@@ -63,4 +64,12 @@ def test_a_damaged_file_is_a_mistake_and_stays(capsys: pytest.CaptureFixture[str
     assert main(WORDS) == 2
     assert "atlas.json is not an atlas" in capsys.readouterr().err.splitlines()[-1]
     assert Path("atlas/atlas.json").read_text() == '{"version": 1, "maps": ['
-    assert [p.name for p in Path("atlas").iterdir()] == ["atlas.json"]
+    assert [p.name for p in Path("atlas").glob("[!.]*")] == ["atlas.json"]
+
+
+def test_two_runs_at_once_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    """While one run holds the folder another is turned away and touches nothing."""
+    with alone(Path("atlas")):
+        assert main(WORDS) == 2
+    assert "another run" in capsys.readouterr().err
+    assert not Path("atlas/atlas.json").exists()

@@ -116,8 +116,8 @@ def _distinct(kind: str, whom: Sequence[Contender]) -> list[Contender]:
     """Return one contender per backend where time schemes make no difference: the static search of skin is one."""
     if kind != "statics":
         return list(whom)
-    return [who for k, who in enumerate(whom) if who.backend not in SHEETS_ONLY
-            or who.backend not in [w.backend for w in whom[:k]]]  # fmt: skip
+    usual = {who.backend: who for who in whom if who.scheme == "conjugate_gradient"}
+    return [who for who in whom if usual.get(who.backend, who) is who]
 
 
 def _of_face(table: dict[str, Choices], effort: Effort, backends: Sequence[str] | None) -> list[Contender]:

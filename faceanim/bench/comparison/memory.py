@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from faceanim.bench.alone import alone
 from faceanim.bench.comparison.candidates import Candidate, candidates
 from faceanim.bench.comparison.plan import Plan, Regions, left_out, options_forecast, options_of_scene, planned
 from faceanim.bench.comparison.reference import reference, rms
 from faceanim.bench.comparison.rows import Comparison, Row, as_json
 from faceanim.bench.comparison.scenes import SCENES, Scene
-from faceanim.bench.comparison.sweep import TABLE, Sweep, Watcher, alone, current
+from faceanim.bench.comparison.sweep import TABLE, Sweep, Watcher, current
 from faceanim.ground.errors import UserError
 from faceanim.ground.files import write_whole
 from faceanim.ground.folders import user_cache, writable_folder

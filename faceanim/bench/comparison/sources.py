@@ -6,6 +6,8 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+import faceanim
+
 ROOMS = ("kernels", "geometry", "tissue", "body", "elements", "backends", "face", "expression")
 """Rooms whose code decides what a run gives and costs."""
 
@@ -13,9 +15,11 @@ ROOMS = ("kernels", "geometry", "tissue", "body", "elements", "backends", "face"
 @cache
 def physics_key() -> str:
     """Return a hash of the sources of `ROOMS`, 16 letters."""
-    package = Path(__file__).resolve().parent.parent
+    package = Path(faceanim.__file__).resolve().parent
     digest = hashlib.sha256()
     for room in ROOMS:
-        for path in sorted((package / room).rglob("*.py")):
+        sources = sorted((package / room).rglob("*.py"))
+        assert sources, f"room {room} holds no sources"
+        for path in sources:
             digest.update(path.relative_to(package).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 
 import msgspec
 
+from faceanim.bench.alone import alone
 from faceanim.bench.comparison.candidates import Candidate, candidate_of
 from faceanim.bench.comparison.reference import key_of, reference, rms
 from faceanim.bench.comparison.rows import Comparison, Row, as_json, load
@@ -21,7 +21,7 @@ from faceanim.bench.comparison.sources import physics_key
 from faceanim.bench.comparison.trial import Job
 from faceanim.ground.cache import content_key
 from faceanim.ground.errors import RunError, UserError
-from faceanim.ground.files import not_written, write_whole
+from faceanim.ground.files import write_whole
 
 TABLE = "comparison.json"
 """The file in which the rows are kept as they come."""
@@ -29,34 +29,6 @@ PATIENCE = 600.0
 """What a candidate may take besides its frames [s]: starting, compiling, preparing."""
 
 Watcher = Callable[[Row], None]
-
-
-@contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Let no second run write into `folder` meanwhile; raise `UserError` if one does already."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / ".running"
-    try:
-        file = path.open("a")
-    except OSError as error:
-        raise not_written(path, error) from error
-    with file:
-        if not _locked(file.fileno()):
-            raise UserError(f"another run is writing into {folder}; wait for it, or give another --out")
-        yield
-
-
-def _locked(file: int) -> bool:
-    """Take the lock, which the system gives back however the process ends; True where there are no locks."""
-    try:
-        import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 def row_key(scene: Scene, candidate: Candidate) -> str:

@@ -108,7 +108,7 @@ def test_a_table_of_another_scene_is_refused(tmp_path: Path, measured: list[str]
 def test_two_runs_at_once_are_refused(tmp_path: Path, measured: list[str]) -> None:
     """While a process holds the folder another is turned away; afterwards it is free, however that process ended."""
     code = (
-        "import sys, time; from pathlib import Path; from faceanim.bench.comparison.sweep import alone\n"
+        "import sys, time; from pathlib import Path; from faceanim.bench.alone import alone\n"
         "with alone(Path(sys.argv[1])):\n    print('held', flush=True); time.sleep(60)\n"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)
