@@ -73,6 +73,8 @@ def patch_fields(body: Body, solid: Solid, pulled: Ints, options: Options) -> Fl
     """
     seeds, way = places(body, pulled, SPACING * options.reach)
     share = np.maximum(0.0, 1.0 - way / (SHARED * SPACING * options.reach)) ** 2
+    pulls = (share[:, pulled] > 0.0).any(axis=1)  # the mirror image of a place need not be near anything that is pulled
+    seeds, share = seeds[pulls], share[pulls]
     cutter = Cutter(solid, options)
     local = replace(options, degree=options.patch_degree)
     out = np.zeros((3 * len(seeds), len(solid.mesh.points), 3))

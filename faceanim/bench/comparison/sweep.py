@@ -35,7 +35,7 @@ def row_key(scene: Scene, candidate: Candidate) -> str:
     """Return what a row is known by: the scene and its reference, the candidate, the sources of the physics."""
     settings = sorted(candidate.settings.items())
     named = (candidate.backend, candidate.scheme, settings, candidate.density, candidate.steps_per_frame)
-    return content_key("row-1", scene.name, key_of(scene), *named, physics_key())
+    return content_key("row-1", scene.name, key_of(scene), *named, physics_key(candidate.backend))
 
 
 def blank(scene: Scene, candidate: Candidate) -> Row:

@@ -248,7 +248,9 @@ def yardstick(scene: Scene, candidate: Candidate) -> Floats | None:
         return None
     settings, steps = YARDSTICK[candidate.backend]
     best = Candidate(candidate.backend, "yardstick", settings, candidate.density, steps)
-    key = content_key("yardstick-1", scene.name, scene.duration, candidate.density, candidate.backend, physics_key())
+    key = content_key(
+        "yardstick-1", scene.name, scene.duration, candidate.density, candidate.backend, physics_key(candidate.backend)
+    )
     kept = load_arrays("yardsticks", key)
     if kept is None:
         kept = {"motion": run(scene, best, prepared(scene.stage(best.density), best)).motion}

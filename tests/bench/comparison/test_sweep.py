@@ -83,7 +83,7 @@ def test_rows_of_an_older_program_are_measured_anew(
 ) -> None:
     """A change of the physics changes every key."""
     run(tmp_path, ONES[:1])
-    monkeypatch.setattr(sweep, "physics_key", lambda: "another")
+    monkeypatch.setattr(sweep, "physics_key", lambda backend: "another")
     run(tmp_path, ONES[:1])
     assert measured == ["linear", "linear"]
 
