@@ -88,6 +88,6 @@ class Progress:
         if self._bar is not None:
             self._bar.update(self._task, description=f"{self._text}: {text}")
         elif not self._quiet:
-            place = f" {self._done}/{self._total}{self._left()}" if self._done else ""
-            self.note(f"{self._text}{place}: {text}")
+            place = f" ({self._done}/{self._total}{self._left()})" if self._done and self._total else ""
+            self.note(f"{self._text}: {text}{place}")
             self._spoke = perf_counter()

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                        help="an option of the backend, e.g. law=linear; may be repeated")  # fmt: skip
     group.add_argument("--steps", metavar="N", help="load steps over which bones move (default: one each 3 mm)")
     group.add_argument("--threads", metavar="N", help="processor cores to use")
-    parser.set_defaults(scheme=None, tolerance=None, adaptive=None)
+    parser.set_defaults(scheme=None, partition_tolerance=None, adaptive=None)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -39,6 +39,7 @@ def test_every_row_of_table_page_and_chart_is_a_measured_run(compared: Path) -> 
     assert json.loads((compared / "comparison.json").read_text())["machine"]
 
 
+@pytest.mark.slow
 def test_a_repetition_changes_no_error(compared: Path, tmp_path: Path) -> None:
     """Measured again elsewhere, errors are the same to the last digit."""
     assert main(["compare", "bar-tension", "--out", str(tmp_path), *QUICK]) == 0
@@ -95,6 +96,7 @@ def own_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 PLAN = ["plan", "bar-tension", "--backends", "modal_warping,finite_elements", "--densities", "coarse", "--quiet"]
 
 
+@pytest.mark.slow
 def test_a_plan_is_measured_and_its_promise_holds(own_memory: None, capsys: pytest.CaptureFixture[str]) -> None:
     """A loose wish gets something cheap, a strict one the elements that are exact, an impossible one the way out."""
     assert main([*PLAN, "--tolerance", "1", "--fps", "60"]) == 0

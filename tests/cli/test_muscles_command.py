@@ -44,6 +44,7 @@ def test_an_image_becomes_muscles_and_an_image_again(
     assert cv2.imread(str(again)).shape == (300, 300, 3)  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_own_muscles_move_the_face(image: Path, tmp_path: Path) -> None:
     """`express --muscles` takes the list, and says so in run.json."""
     out = tmp_path / "mine.toml"
@@ -101,6 +102,7 @@ def test_check_lists_what_is_wrong_and_marks_it(
     assert not image.with_name("front_checked.png").exists()
 
 
+@pytest.mark.slow
 def test_a_picture_without_some_muscles_can_be_completed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Those that it lacks come from the built-in list, when asked."""
     few = tmp_path / "few.toml"

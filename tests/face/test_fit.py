@@ -175,6 +175,7 @@ def test_bad_depth_table_is_refused():
         parse_depths("[nasion", "mine.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (1.12, 0.95, 1.04)])
 def test_fit_reaches_the_depths_inside_the_skin(head, generic, depths, stretch):
     """On the built-in head and on a stretched one: no bone outside, 2 mm of tissue, depths within 1 mm RMS."""

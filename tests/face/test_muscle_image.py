@@ -48,7 +48,9 @@ def picture_of(kind: str, size: int = 512) -> np.ndarray:
 AT_512 = ("as drawn", "JPEG 90")
 
 
-@pytest.mark.parametrize("treatment", TREATMENTS)
+@pytest.mark.parametrize(
+    "treatment", [pytest.param(name, marks=[] if name in AT_512 else pytest.mark.slow) for name in TREATMENTS]
+)
 @pytest.mark.parametrize("kind", ["front", "cylinder"])
 def test_drawn_and_read_again(kind: str, treatment: str) -> None:
     """All muscles are paired and named right, whatever happened to the file; at 512 x 512 within a pixel's size."""
@@ -125,6 +127,7 @@ def _random_muscles(seed: int, count: int) -> dict[str, AnyMuscle]:
     return rows
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 16), st.sampled_from(["as drawn", "JPEG 90"]))
 def test_random_muscles_drawn_and_read_again(seed: int, count: int, treatment: str) -> None:
@@ -147,6 +150,7 @@ def test_random_muscles_drawn_and_read_again(seed: int, count: int, treatment: s
 # Other heads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", ["coarse", "fine"])
 def test_the_same_image_fits_the_other_densities(density: str) -> None:
     """At the same places within 1.5 mm."""
@@ -156,6 +160,7 @@ def test_the_same_image_fits_the_other_densities(density: str) -> None:
     assert np.median(errors) < 0.5 and errors.max() < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["front", "cylinder"])
 @pytest.mark.parametrize("scale", [0.6, 1.3])
 def test_the_same_image_fits_a_scaled_head(kind: str, scale: float) -> None:
@@ -171,6 +176,7 @@ def test_the_same_image_fits_a_scaled_head(kind: str, scale: float) -> None:
     assert row.radius == pytest.approx(scale * LINES["zygomaticus_major_left"].radius)  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_the_mirrored_image_on_the_mirrored_head() -> None:
     """Gives the mirrored muscles, left and right exchanged."""
     name = "corrugator_left"

@@ -260,6 +260,7 @@ def test_random_faces_are_read(seed):
     assert_found(find_marks(it.on(skin(light=0.75 if seed % 2 else 1.1))), it, 0.1, 0.4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_random_faces_are_read_after_jpeg_and_resizing(seed):
     it = random_face(seed)

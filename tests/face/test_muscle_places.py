@@ -97,6 +97,7 @@ def test_rings_are_found_from_their_axis_ends(head: str, ring: str) -> None:
             np.testing.assert_allclose(row.axes, known.axes, atol=0.02)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(range(6)), st.integers(0, 2**31))
 def test_axis_ends_are_paired_in_any_order(order: list[int], seed: int) -> None:

@@ -67,6 +67,7 @@ def lift(moment: Moment) -> float:
     return float(moment.points[node, 2] - body.surface.points[node, 2])
 
 
+@pytest.mark.slow
 def test_it_keeps_time(live: LiveSimulation) -> None:
     """Thirty updates a second of real time, neither more nor fewer."""
     start, before = time.perf_counter(), live.updates
@@ -139,6 +140,7 @@ def test_divergence_resets_and_reports(live: LiveSimulation, watch: Watch) -> No
     until(lambda: live.updates > count + 2)
 
 
+@pytest.mark.slow
 def test_a_slow_solver_is_counted_honestly(live: LiveSimulation, watch: Watch) -> None:
     """Fewer updates than wanted are told as such; messages and targets still get through."""
     live.exchange(lambda old: replace(old, options=ToyOptions(pause=0.1)))

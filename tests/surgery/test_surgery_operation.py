@@ -33,6 +33,7 @@ def _operation(face: Face, extra: str) -> Operation:
     return operate(face, parse_plan(BLOCK.format(extra=extra), "test"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", plan_names())
 def test_every_built_in_plan_cuts_soundly(face: Face, name: str) -> None:
     """Pieces and rest are closed, volumes add up to 1e-6, and each piece is a middling part of its bone."""

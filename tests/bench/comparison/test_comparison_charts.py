@@ -86,6 +86,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_every_comparison_gives_a_chart(case: str, tmp_path: Path) -> None:
     """Both charts are written as pictures with something on them."""
@@ -124,6 +125,7 @@ def test_stepping_is_shown_only_where_it_was_measured(figure: Any) -> None:
     assert len(figure.axes) == 2
 
 
+@pytest.mark.slow
 def test_the_overview_has_a_panel_for_each_scene() -> None:
     """Five scenes give five visible panels with their names."""
     names = ["bar", "smile", "lips", "jaw", "sheet"]
