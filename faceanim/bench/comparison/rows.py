@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import astuple, dataclass, field, replace
-from math import inf, isfinite
+from math import floor, inf, isfinite, log
 from typing import Any
 
 import msgspec
@@ -108,12 +108,20 @@ def worst(row: Row) -> float:
 
 CLOSE = 1.2
 """Costs within this factor count as equal: a machine's noise."""
+ALIKE = 1.02
+"""Errors are graded in bands of this factor: a gain of less is none."""
+
+
+def grade(row: Row) -> float:
+    """Return the band of a row's error, a whole number, the lower the better; -inf without error."""
+    error = worst(row)
+    return floor(log(error) / log(ALIKE)) if error > 0.0 else -inf
 
 
 def front(rows: list[Row]) -> list[Row]:
-    """Return the Pareto front, cheapest first, with costs within `CLOSE` of each other taken as equal.
+    """Return the Pareto front, cheapest first, with costs within `CLOSE` and errors of one `grade` taken as equal.
 
-    From the most accurate row on, each next one has to be cheaper by more than `CLOSE` than all that were kept. Hence
+    From the most accurate grade on, each next one has to be cheaper by more than `CLOSE` than all that were kept. Hence
     no row of the front is beaten by any other, any two differ in cost by more than `CLOSE`, and every row that was
     left out has one on the front that is at least as accurate at no more than `CLOSE` of its cost. (To drop whatever
     *any* row beats within `CLOSE` would not do: in a chain of rows, each a little dearer and better than the last,
@@ -122,7 +130,9 @@ def front(rows: list[Row]) -> list[Row]:
     The kernel of the relation "beats within `CLOSE`", a coverage in the sense of Papadimitriou & Yannakakis 2000.
     """
     kept: list[Row] = []
-    for row in sorted((row for row in rows if row.counts), key=lambda r: (worst(r), r.frame_ms, r.label, r.key)):
+    for row in sorted(
+        (row for row in rows if row.counts), key=lambda r: (grade(r), r.frame_ms, worst(r), r.label, r.key)
+    ):
         if all((other.frame_ms or 0.0) > CLOSE * (row.frame_ms or 0.0) for other in kept):
             kept.append(row)
     return kept[::-1]
