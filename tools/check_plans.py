@@ -24,7 +24,7 @@ from faceanim.cli.progress import Progress
 from faceanim.ground.folders import user_cache
 from faceanim.ground.notes import listening
 
-WISHES = ((1.0, 30.0), (1.5, 30.0), (2.0, 60.0), (3.0, 60.0))
+WISHES = ((0.5, 60.0), (1.0, 60.0), (1.5, 60.0), (2.0, 60.0))
 """Tolerance [mm] and frames per second."""
 HEAD = (
     "| scene | wish | plan | promised | came out | held |\n"
@@ -44,11 +44,10 @@ def checked(progress: Progress) -> tuple[str, int, int]:
     """Return a Markdown table of all plans, how many held, and how many there were."""
     text, held, made = HEAD, 0, 0
     for name in UNSEEN:
+        scene = scene_named(name)
         for tolerance, fps in WISHES:
             progress.stage(f"{name}, {tolerance:g} mm at {fps:g} frames/s")
-            plan = plan_for(
-                scene_named(name), tolerance, fps, watcher=lambda row: progress.detail(row.label), unseen=True
-            )
+            plan = plan_for(scene, tolerance, fps, watcher=lambda row: progress.detail(row.label), unseen=True)
             wish = f"{tolerance:g} mm, {fps:g} frames/s"
             if plan.chosen is None:
                 text += f"| {name} | {wish} | none: {plan.sentence().partition(': ')[2]} | - | - | - |\n"

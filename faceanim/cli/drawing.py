@@ -11,7 +11,7 @@ import numpy as np
 from faceanim.bench.metrics import principal_strain
 from faceanim.ground.arrays import Floats
 from faceanim.ground.errors import UserError
-from faceanim.render.colormap import Scale
+from faceanim.render.colormap import Scale, round_top
 from faceanim.render.occlusion import vertex_openness
 from faceanim.render.scene import Part, face_scene
 from faceanim.render.shading import Texture
@@ -135,15 +135,10 @@ def _scale(colour: str, values: Sequence[Floats]) -> Scale:
     """Return a scale with a round top that spans `values`."""
     share = 1.0 if colour == "displacement" else 0.99
     largest = max((float(np.quantile(np.abs(v), share)) for v in values), default=0.0)
-    top = _round_up(max(largest, 1.0))
+    top = round_top(max(largest, 1.0))
     if colour == "displacement":
         return Scale(0.0, top, "displacement [mm]")
     return Scale(-top, top, "principal strain [%]", "two_sided")
-
-
-def _round_up(value: float) -> float:
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0) if step * power >= value))
 
 
 def session_drawer(size: int) -> Callable[[Session, Floats, float], Any]:

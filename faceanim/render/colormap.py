@@ -95,3 +95,12 @@ PARTITION: tuple[tuple[str, tuple[float, float, float]], ...] = (
     ("static", (0.62, 0.66, 0.70)),
 )
 """Node sets 0, 1, 2 of the adaptive scheme: name and sRGB colour."""
+
+
+def round_top(value: float) -> float:
+    """Return the next round number from `value` on, for the upper end of a scale (1 if `value` is not positive)."""
+    if not 0.0 < value < np.inf:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    steps = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+    return float(next((s * power for s in steps if s * power >= 0.9999 * value), 10.0 * power))

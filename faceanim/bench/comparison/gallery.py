@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from faceanim.bench.comparison.pictures import error_picture, face_error_picture, round_top
+from faceanim.bench.comparison.pictures import error_picture, face_error_picture
 from faceanim.bench.comparison.reference import reference
 from faceanim.bench.comparison.rows import Comparison, Row
 from faceanim.bench.comparison.scenes import Scene
 from faceanim.ground.arrays import Floats
 from faceanim.ground.notes import tell
+from faceanim.render.colormap import round_top
 from faceanim.render.occlusion import vertex_openness
 from faceanim.render.sequence import write_png
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 from faceanim.bench.alone import alone
@@ -111,6 +112,7 @@ def _chosen(rows: Sequence[Row], backends: tuple[str, ...], densities: tuple[str
     ]
 
 
+@lru_cache(maxsize=8)
 def movement_of(scene: Scene) -> Regions:
     """Return how far each region of a face moves [mm] by a quick look: the balance of `mass_spring` on the coarse mesh."""
     from faceanim.backends import make_solver

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from bodies import bridge
 
-from faceanim.bench.comparison.pictures import error_picture, face_error_picture, round_top
+from faceanim.bench.comparison.pictures import error_picture, face_error_picture
 from faceanim.face.library import load_face
 from faceanim.ground.errors import UserError
+from faceanim.render.colormap import round_top
 
 SURFACE = bridge().surface
 
