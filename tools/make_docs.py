@@ -166,10 +166,10 @@ def comparisons(work: Path) -> None:
 
 def stability(work: Path) -> None:
     """Make the stability maps of skin and bar and keep the overview and some of the maps in docs/."""
-    for scene in ("sheet", "bar"):
-        faceanim(["atlas", scene, "--out", str(work / f"atlas-{scene}")])
+    faceanim(["atlas", "sheet", "--out", str(work / "atlas-sheet")])
+    faceanim(["atlas", "bar", "--quick", "--out", str(work / "atlas-bar")])
     copied(work / "atlas-sheet", {"atlas.png": "atlas.png"})
-    copied(work / "atlas-bar", {"atlas.png": "atlas_bar.png"})
+    copied(work / "atlas-bar", {"bar_twist.png": "atlas_twist.png"})
 
 
 def claims(work: Path) -> None:
@@ -178,7 +178,8 @@ def claims(work: Path) -> None:
     (DOCS / "claims").mkdir(exist_ok=True)
     for made in sorted((work / "claims").iterdir()):
         (DOCS / "claims" / made.name).write_bytes(made.read_bytes())
-    copied(work / "claims", {"claims.md": "claims.md"})
+    overview = (work / "claims" / "claims.md").read_text(encoding="utf-8")
+    (DOCS / "claims.md").write_text(overview.replace("](", "](claims/"), encoding="utf-8")
 
 
 def copied(folder: Path, names: dict[str, str]) -> None:
@@ -199,7 +200,7 @@ def insert_tables() -> None:
     for name in ("framerate", "faithfulness", "muscles", "face_backends", "four_models", "fronts", "claims"):
         if not (DOCS / f"{name}.md").exists():
             continue
-        table = (DOCS / f"{name}.md").read_text(encoding="utf-8")
+        table = (DOCS / f"{name}.md").read_text(encoding="utf-8").replace("](claims/", "](docs/claims/")
         marks = f"<!-- table: {name} -->", f"<!-- end of table: {name} -->"
         pattern = re.escape(marks[0]) + ".*?" + re.escape(marks[1])
         text = re.sub(pattern, lambda _: f"{marks[0]}\n{table}{marks[1]}", text, flags=re.DOTALL)  # noqa: B023

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from faceanim.cli.choices import number
+from faceanim.ground.errors import UserError
 
 if TYPE_CHECKING:
     from faceanim.bench.comparison.rows import Comparison, Row
@@ -68,9 +69,12 @@ def _compared(args: argparse.Namespace, scene: Scene, folder: Path, limit: float
         progress.stage(f"what {scene.name} is measured against")
         sweep = Sweep(scene, chosen, folder, limit=limit, again=args.again)
         comparison = sweep.run(machine_name(), _watcher(progress, len(chosen)))
-        remember(scene, comparison)
         progress.stage("drawing")
         comparison = presented(scene, comparison, folder)
+        try:
+            remember(scene, comparison)
+        except UserError as error:
+            progress.note(f"not remembered for plans: {error}")
     _print(comparison)
     print(f"saved {', '.join(NAMES)} in {folder}")
     return comparison

@@ -351,3 +351,14 @@ def test_what_is_left_out_is_said() -> None:
     body = held_slab(material=Material("wet", 1e-6, 20.0, 0.45), stiffness_damping=0.01)
     solver = make_solver("octree_mass_spring", body, Options(cells=8))
     assert any("Poisson" in text for text in solver.notices) and any("stiffness" in text for text in solver.notices)
+
+
+def test_the_slowest_vibration_of_a_slender_bar_is_found() -> None:
+    """Both bending vibrations of a square bar are equally slow and far below the third: the search bears that, and the
+    frequency is that of a cantilever, 1.875^2 sqrt(E I / rho A L^4), within the error of four cells across."""
+    mesh = box_tets((20, 4, 4), (100.0, 20.0, 20.0))
+    body = solid_body(mesh, Material("jelly", 1.04e-6, 30.0, 0.25), mesh.points[:, 0] < 1e-9, damping=2.0)
+    solver = make_solver("octree_mass_spring", body, Options(cells=20))
+    found = solver.rig(solver.base).model.slowest()
+    expected = 1.875104**2 * np.sqrt(30.0 * 20.0**2 / 12.0 / (1.04e-6 * 100.0**4))
+    assert 0.75 * expected < found < 1.25 * expected

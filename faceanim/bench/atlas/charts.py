@@ -132,7 +132,7 @@ def map_chart(one: Map, path: Path) -> None:
     made = figure(wide, max(3.4, 0.32 * len(one.y.values) + (2.9 if one.x.words else 2.3)))
     axes = made.subplots()
     draw_map(axes, one)
-    axes.set_title(f"{one.scene}: {one.title}" if one.backend == "" else f"{one.scene}: {_plain(one)}", fontsize=11)
+    made.suptitle(f"{one.scene}: {one.title}" if one.backend == "" else f"{one.scene}: {_plain(one)}", fontsize=11)
     if one.limits:
         axes.legend(fontsize=7.5, loc="best", framealpha=0.9)
     _legend(made, letters=True)
