@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     print(found.sentence())
     if found.chosen is None:
         return 1
-    print(f"faceanim express NAME --fps {fps:g} {command_line(found)}")
+    print(_details(found))
     return 0
 
 
@@ -64,12 +64,17 @@ def plan_shown(progress: Progress, scene: Any, tolerance: float, fps: float, **c
         return plan_for(scene, tolerance, fps, watcher=lambda row: progress.detail(row.label), **choices)
 
 
-def command_line(found: Plan) -> str:
-    """Return the options of `faceanim express` that do what a plan chooses."""
+def _details(found: Plan) -> str:
+    """Return what was chosen, a line each: backend, options, density, step and partition."""
     assert found.chosen is not None
-    row = found.chosen.row
-    settings = "".join(f" --option {name}={value}" for name, value in row.settings.items() if name != "adaptive")
-    adaptive = {True: " --adaptive", False: " --full"}.get(row.settings.get("adaptive", False), "")
-    if row.backend != "mass_spring":
-        adaptive = ""
-    return f"--backend {row.backend} --density {row.density}{adaptive}{settings}"
+    row, steps = found.chosen.row, found.chosen.steps_per_frame
+    options = {name: value for name, value in row.settings.items() if name != "adaptive"}
+    partition = "adaptive: dynamic, quasi-static and static" if row.settings.get("adaptive") else "every one"
+    lines = {
+        "backend": row.backend,
+        "options": ", ".join(f"{name}={value}" for name, value in options.items()) or "its defaults",
+        "density": row.density,
+        "step": f"1/{found.fps * steps:g} s, {steps} a frame",
+        "vertices": partition,
+    }
+    return "\n".join(f"  {name:9} {words}" for name, words in lines.items())

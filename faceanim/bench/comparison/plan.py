@@ -49,7 +49,7 @@ class Option:
 class Plan:
     """What was asked, what is chosen (None = nothing meets both), and the nearest to it on either side.
 
-    accurate : the fastest within the tolerance   fast : the most accurate at the rate
+    accurate : the fastest within the tolerance   fast : the most accurate at the rate   best : the most accurate of all
     measured : the scene itself has been measured; otherwise `hits` of `trials` forecasts of measured scenes held
     uncertainty : RMS error of the reference itself [mm]
     """
@@ -61,6 +61,7 @@ class Plan:
     chosen: Option | None
     accurate: Option | None
     fast: Option | None
+    best: Option | None
     measured: bool
     hits: int
     trials: int
@@ -78,10 +79,13 @@ class Plan:
         if self.fast is not None:
             ways.append(f"allow {_up(self.fast.error)} mm ({self.fast.row.label})")
         if self.accurate is not None:
-            rate = 1e3 / self.accurate.reserved_ms
-            ways.append(f"be content with {_down(rate)} of these frames a second ({self.accurate.row.label})")
+            rate = _down(1e3 / self.accurate.reserved_ms)
+            ways.append(f"be content with {rate} of these frames a second ({self.accurate.row.label})")
+        elif self.best is not None and (self.fast is None or self.best.error < self.fast.error):
+            rate, name = _down(1e3 / self.best.reserved_ms), self.best.row.label
+            ways.append(f"allow {_up(self.best.error)} mm and be content with {rate} of these frames a second ({name})")
         if not ways:
-            ways.append("nothing measured is as fast or as accurate as that; relax both")
+            ways.append("no candidate came so far; relax both")
         return f"nothing meets {self.tolerance:g} mm at {self.fps:g} frames/s: " + ", or ".join(ways)
 
     def record(self) -> dict[str, Any]:
@@ -245,5 +249,6 @@ def planned(
         key=lambda o: (o.error, o.frame_ms),
         default=None,
     )
+    best = min((o for o in options if math.isfinite(o.error)), key=lambda o: (o.error, o.frame_ms), default=None)
     chosen = _cheapest(options, tolerance, fps)
-    return Plan(scene, tolerance, fps, against, chosen, accurate, fast, measured, *trials, uncertainty)
+    return Plan(scene, tolerance, fps, against, chosen, accurate, fast, best, measured, *trials, uncertainty)

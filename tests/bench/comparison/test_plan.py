@@ -126,3 +126,9 @@ def test_wishes_outside_the_limits_are_refused(tolerance: float, fps: float, wor
         plan.planned("s", plan.options_of_scene(ROWS, 60.0, "reference"), tolerance, fps)
     with pytest.raises(UserError, match="no candidate"):
         plan.planned("s", [], 1.0, 60.0)
+
+
+def test_what_no_rate_can_reach_is_said_too() -> None:
+    """Nothing is as accurate as 0.05 mm at any rate: the most accurate of all is named with the rate it keeps."""
+    words = plan_of(ROWS, 0.05, 60.0).sentence()
+    assert "allow 0.8 mm (middle)" in words and "allow 0.1 mm and be content with" in words and "(slow)" in words
