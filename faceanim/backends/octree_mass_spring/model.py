@@ -148,9 +148,7 @@ class Model:
         solved = factored(k + 1e-12 * float(k.diagonal().max()) * sparse.identity(k.shape[0], format="csc"))
         x, lowest = np.tile(np.eye(3), (int(free.sum()), 1)), np.inf
         for _ in range(8):
-            x = np.linalg.qr(solved(mass[:, None] * x))[
-                0
-            ]  # the three columns would all turn into the slowest vibration
+            x, _ = np.linalg.qr(solved(mass[:, None] * x))  # else all columns turn into the slowest vibration
             value = eigh(x.T @ (k @ x), x.T @ (mass[:, None] * x), eigvals_only=True)
             lowest = float(max(value[0], 0.0))
         return float(np.sqrt(lowest))
