@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -22,6 +23,8 @@ from faceanim.session.recording import machine
 
 HOPELESS = 4.0
 """A candidate that takes longer than a frame by this factor in one scene is not tried in the next."""
+LIMIT = 60.0
+"""What the frames of one candidate may take when it is measured for a plan [s]."""
 TRAINING = tuple(name for name in SCENES if name.startswith("face-"))
 """The scenes from which other expressions are forecast."""
 
@@ -86,24 +89,33 @@ def plan_for(
     Raises `UserError` for limits, or if no candidate is left.
     """
     wanted = candidates(scene.name, quick=True, backends=backends, densities=densities)
-    if not unseen and (scene.name in SCENES or remembered(scene)):
-        rows = measured(scene, wanted, watcher, limit=60.0) if scene.name in SCENES else remembered(scene)
-        known = _chosen(rows, backends, densities)
-        error = reference(scene).uncertainty
-        options = options_of_scene(known, fps, against)
-        return planned(scene.name, options, tolerance, fps, against=against, uncertainty=error)
-    rows = []
+    if scene.name in SCENES and not unseen:
+        rows = measured(scene, wanted, watcher, limit=LIMIT)
+    else:
+        rows = [] if unseen else remembered(scene)
+    if rows:
+        options = options_of_scene(_chosen(rows, backends, densities), fps, against)
+        return planned(scene.name, options, tolerance, fps, against=against, uncertainty=reference(scene).uncertainty)
+    known = _chosen(_training(wanted, fps, watcher), backends, densities)
+    return planned(
+        scene.name, options_forecast(known, movement_of(scene), fps, against), tolerance, fps, against=against,
+        uncertainty=max(reference(SCENES[name]).uncertainty for name in TRAINING), measured=False,
+        trials=left_out(known, tolerance, fps, against),
+    )  # fmt: skip
+
+
+def _training(wanted: Sequence[Candidate], fps: float, watcher: Watcher) -> list[Row]:
+    """Return the rows of all candidates that have been measured in every scene of `TRAINING`, measuring what is missing.
+
+    Who is hopelessly slow in one scene is not tried in the next.
+    """
+    rows: list[Row] = []
     for name in TRAINING:
-        rows += measured(SCENES[name], wanted, watcher, limit=60.0)
+        rows += measured(SCENES[name], wanted, watcher, limit=LIMIT)
         slow = {row.label for row in rows if row.frame_ms is None or row.frame_ms > HOPELESS * 1e3 / fps}
         wanted = [one for one in wanted if one.label not in slow]
-    known = _chosen(rows, backends, densities)
-    complete = [row for row in known if sum(r.label == row.label for r in known) == len(TRAINING)]
-    error = max(reference(SCENES[name]).uncertainty for name in TRAINING)
-    return planned(
-        scene.name, options_forecast(complete, movement_of(scene), fps, against), tolerance, fps, against=against,
-        uncertainty=error, measured=False, trials=left_out(complete, tolerance, fps, against),
-    )  # fmt: skip
+    count = Counter(row.label for row in rows)
+    return [row for row in rows if count[row.label] == len(TRAINING)]
 
 
 def _chosen(rows: Sequence[Row], backends: tuple[str, ...], densities: tuple[str, ...]) -> list[Row]:
