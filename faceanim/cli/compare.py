@@ -12,6 +12,7 @@ from faceanim.ground.errors import UserError
 if TYPE_CHECKING:
     from faceanim.bench.comparison.rows import Comparison, Row
     from faceanim.bench.comparison.scenes import Scene
+    from faceanim.bench.comparison.sweep import Sweep
     from faceanim.cli.progress import Progress
 
 NAMES = ("comparison.json", "comparison.csv", "comparison.png", "comparison.html")
@@ -58,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _compared(args: argparse.Namespace, scene: Scene, folder: Path, limit: float) -> Comparison:
     """Measure one scene, write its files and print its front."""
+    from faceanim.bench.alone import alone
     from faceanim.bench.comparison.candidates import candidates
     from faceanim.bench.comparison.memory import machine_name, remember
     from faceanim.bench.comparison.sweep import Sweep
@@ -70,7 +72,8 @@ def _compared(args: argparse.Namespace, scene: Scene, folder: Path, limit: float
         sweep = Sweep(scene, chosen, folder, limit=limit, again=args.again)
         comparison = sweep.run(machine_name(), _watcher(progress, len(chosen)))
         progress.stage("drawing")
-        comparison = presented(scene, comparison, folder)
+        with alone(folder):
+            comparison = presented(sweep, comparison)
         try:
             remember(scene, comparison)
         except UserError as error:
@@ -115,16 +118,17 @@ def _came_out(row: Row) -> str:
     return f"{row.frame_ms:.3g} ms a frame, {worst(row):.3g} mm"
 
 
-def presented(scene: Scene, comparison: Comparison, folder: Path) -> Comparison:
-    """Write CSV, chart, pictures and page; return the comparison whose rows name their pictures."""
+def presented(sweep: Sweep, comparison: Comparison) -> Comparison:
+    """Write table, chart, pictures and page; return the comparison whose rows name their pictures."""
     from faceanim.bench.comparison.charts import pareto_chart
     from faceanim.bench.comparison.gallery import draw_all
     from faceanim.bench.comparison.page import page
-    from faceanim.bench.comparison.rows import as_csv, as_json
+    from faceanim.bench.comparison.rows import as_csv
     from faceanim.ground.files import write_whole
 
-    comparison = draw_all(scene, comparison, folder)
-    write_whole(folder / NAMES[0], as_json(comparison), lasting=True)
+    folder = sweep.folder
+    comparison = draw_all(sweep.scene, comparison, folder)
+    sweep.store(comparison)
     write_whole(folder / NAMES[1], as_csv(comparison).encode())
     pareto_chart(comparison, folder / NAMES[2])
     write_whole(folder / NAMES[3], page(comparison, folder / NAMES[2], folder).encode())

@@ -39,6 +39,15 @@ def test_every_row_of_table_page_and_chart_is_a_measured_run(compared: Path) -> 
     assert json.loads((compared / "comparison.json").read_text())["machine"]
 
 
+def test_a_smaller_choice_loses_nothing(compared: Path) -> None:
+    """A run of fewer candidates in the same folder shows those, and the table keeps the others."""
+    before = {row.key for row in load((compared / "comparison.json").read_bytes(), "table").rows}
+    fewer = ["--quick", "--backends", "weighted_residual", "--densities", "coarse", "--quiet"]
+    assert main(["compare", "bar-tension", "--out", str(compared), *fewer]) == 0
+    assert {row.key for row in load((compared / "comparison.json").read_bytes(), "table").rows} == before
+    assert main(["compare", "bar-tension", "--out", str(compared), *QUICK]) == 0
+
+
 @pytest.mark.slow
 def test_a_repetition_changes_no_error(compared: Path, tmp_path: Path) -> None:
     """Measured again elsewhere, errors are the same to the last digit."""

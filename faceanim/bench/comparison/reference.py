@@ -52,7 +52,10 @@ def rms(field: Floats) -> float:
 
 
 def key_of(scene: Scene) -> str:
-    """Return what a reference is known by: the scene's definition and the files it is made from."""
+    """Return what a reference is known by: the scene's times and levels and the files it is made from.
+
+    What `Scene.build` does is not seen: change `VERSION` with the bodies and loads of the scenes.
+    """
     parts: list[Any] = [scene.name, scene.rise, scene.duration, scene.release, scene.order, FPS]
     parts += [str(sorted(asdict(level).items())) for level in scene.levels]
     if scene.name.startswith("face-"):

@@ -65,21 +65,26 @@ class Sweep:
         Raises `UserError` for a table that cannot be read or a second run in the folder, `RunError` if the disk is full.
         """
         with alone(self.folder):
-            known = {} if self.again else self.known()
+            known = self.known()
             found = reference(self.scene)
             comparison = Comparison(
                 self.scene.name, self.scene.title, found.text, found.uncertainty, rms(found.balance), machine
             )
             wanted = [blank(self.scene, one) for one in self.candidates]
-            kept = {row.key: known[row.key] for row in wanted if row.key in known}
+            kept = {} if self.again else {row.key: known[row.key] for row in wanted if row.key in known}
             for row, candidate in zip(wanted, self.candidates, strict=True):
                 if row.key not in kept:
                     kept[row.key] = self.measured(row, candidate)
-                    others = [one for key, one in known.items() if key not in kept and current(one, self.scene)]
-                    rows = [kept[r.key] for r in wanted if r.key in kept] + others
-                    write_whole(self.folder / TABLE, as_json(replace(comparison, rows=rows)), lasting=True)
+                    self.store(replace(comparison, rows=[kept[r.key] for r in wanted if r.key in kept]))
                 watcher(kept[row.key])
             return replace(comparison, rows=[kept[row.key] for row in wanted])
+
+    def store(self, comparison: Comparison) -> None:
+        """Write the table: the rows of `comparison` and, after them, those of earlier runs that it does not hold."""
+        held = {row.key for row in comparison.rows}
+        others = [row for key, row in self.known().items() if key not in held and current(row, self.scene)]
+        whole = replace(comparison, rows=[*comparison.rows, *others])
+        write_whole(self.folder / TABLE, as_json(whole), lasting=True)
 
     def known(self) -> dict[str, Row]:
         """Return the rows that an earlier run left, by key; raise `UserError` for a table of another scene or none."""

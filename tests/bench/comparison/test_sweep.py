@@ -76,6 +76,9 @@ def test_rows_that_are_not_asked_for_stay(tmp_path: Path, measured: list[str]) -
     measured.clear()
     run(tmp_path, [*ONES, extra])
     assert measured == []
+    run(tmp_path, [extra], again=True)
+    assert measured == ["rotation_strain"]
+    assert len(load((tmp_path / TABLE).read_bytes(), "table").rows) == 4
 
 
 def test_rows_of_an_older_program_are_measured_anew(
